@@ -28,11 +28,10 @@ STALE_S = 60.0
 def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[BinaryIO]:
     """A file to write that takes the place of ``path`` when, and only when, the block ends without an error.
 
-    Several may write one path at a time: each file is whole, and the last one stays. Folders above it that are missing
+    Several processes may write one path at a time: each file is whole, and the last one stays. Missing folders above it
     are made; what killed runs have left of the same path is removed.
-    durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one. Without
-    it, for files whose readers check them.
-    OSError names the path also where writing fails (a full disk).
+    durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one; False
+    for files whose readers check them. OSError names the path also where writing fails (a full disk).
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,8 +65,8 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> Path:
 
 @contextmanager
 def replacing_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder of the same name, to make and to fill, that becomes ``path`` when, and only when, the block ends without
-    an error. overwrite: in place of a folder that is there; else there must be none."""
+    """The path of a folder to make and to fill, which becomes ``path`` when, and only when, the block ends without an
+    error. overwrite: it may take the place of a folder that is there; else there must be none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
@@ -79,11 +78,12 @@ def replacing_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -
     try:
         with locked(temporary):
             yield temporary / path.name
+            # A folder that is not empty cannot be replaced: the old one steps aside first.
             moved = [path.rename(temporary / f"{path.name}.before")] if overwrite and path.exists() else []
             try:
                 os.replace(temporary / path.name, path)
             except BaseException:
-                for old in moved:  # else it would go with the temporary folder
+                for old in moved:  # back, or it would be removed with the temporary folder
                     old.rename(path)
                 raise
     finally:
@@ -123,13 +123,15 @@ def _lock_file(folder: Path) -> IO[str]:
                 f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
                 "another folder"
             )
+        # A run that has just ended may have removed the file between opening and locking it: then a lock on it keeps
+        # nobody out, and the next turn makes a new one.
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), (folder / LOCK).stat()):
                 file.truncate(0)
                 file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}")
                 file.flush()
                 return file
-        file.close()  # of a run that has just ended, and has removed it: nobody else would meet it
+        file.close()
 
 
 def _hold(file: IO[str] | IO[bytes]) -> bool:
@@ -139,7 +141,7 @@ def _hold(file: IO[str] | IO[bytes]) -> bool:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        except OSError:  # a disk of a network that knows no locks
+        except OSError:  # a network drive without locks
             return True
     return True
 
@@ -149,7 +151,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _glob_name(path: Path) -> str:
-    """The name as a pattern that means itself."""
+    """The name as a glob pattern that matches it alone."""
     return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in path.name)
 
 
@@ -164,7 +166,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put a new name on the disk, where the system lets one."""
+    """Put a folder's new entries on the disk, where the system can."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -57,15 +57,15 @@ if TYPE_CHECKING:
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
 DECODED = 4
-"""Mask maps of images with several faces that are kept: faces come one after the other, some side by side."""
+"""Decoded mask maps that are kept for images with several faces, which are asked for one after the other."""
 FUSED_FRAMES = 300
-"""Depth images that are fused at most, evenly spread over a recording, whose neighbors show almost the same."""
+"""At most so many depth images are fused, spread evenly: neighbors in a recording show almost the same."""
 
 
 @dataclass(frozen=True)
 class CapturePoses:
-    """names: the views', a pinhole image each. source: the pose file or folder. is_recording: every frame of a video
-    has a pose, and some of them masks."""
+    """The posed pinhole images of a capture. names: of their views. source: the pose file or folder. is_recording: the
+    frames are those of a video, of which perhaps only some have masks."""
 
     names: tuple[str, ...]
     images: tuple[PosedImage, ...]
@@ -87,9 +87,9 @@ def read_capture(
     repairs: of mistakes in the files, such as "axes=flipped" (formats/repairs.py lists them); left out, those that the
         folder's ``repairs.json`` names, which `og-pointcloud repair` writes.
 
-    The scene's masks and images are functions that read on demand; poses, features and points are read, and everything
-    that can be told from headers is checked, here. Raises SceneError with the cause and the cure; warns of images
-    that are listed but absent and of frames without a pose, which are left out.
+    Masks and images are read later, on demand; poses, features and points are read here, and whatever file headers tell
+    is checked. Raises SceneError with the cause and the cure; warns of images that are listed but absent and of frames
+    without a pose, which are left out.
 
     >>> import og_pointcloud as og
     >>> og.read_capture("no_such_folder")
@@ -103,7 +103,7 @@ def read_capture(
     shown = _with_masks(capture, poses) if poses.is_recording else poses
     layers, feature_space = _layers(capture, shown, mask_level)
     layers = repaired_layers(layers, applied)
-    points = read_geometry(capture, poses, gaussians)
+    points = read_geometry(capture, poses, gaussians)  # all frames: depth counts without masks too
     files = find_images(capture, shown.images)
     views = tuple(
         _view(name, image, layer, file, points.origin)
@@ -197,6 +197,7 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
     """File stems; where two images share one (rigs demand it), paths from the folder that all images share."""
     paths = [posixpath.normpath(without_suffix(image.path)) for image in images]
     stems = [posixpath.basename(path) for path in paths]
+    # Where two images have one path, no name tells them apart: the scene refuses such stems.
     if len(set(stems)) == len(stems) or len(set(paths)) < len(paths):
         return tuple(stems)
     paths = [path.lstrip("/") for path in paths]
@@ -228,15 +229,17 @@ def _has_mask(capture: Path, name: str) -> bool:
 
 
 def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLayer], str]:
-    """The masks of each view, and the name of their feature space. Those of an image as it is are split with it."""
+    """The masks of each view, and the name of their feature space. Masks of a whole image are split with it."""
     faces = [image.face for image in poses.images]
-    called = [  # of a cube's face without masks of its own the image's name
+    # The name that each view's masks are stored under: of a cube's face without masks of its own, the image's.
+    called = [
         posixpath.dirname(name) if face and face.name and not _has_mask(capture, name) else name
         for name, face in zip(poses.names, faces, strict=True)
     ]
     distinct = list(dict.fromkeys(called))
     read, feature_space = _read_masks(capture, distinct, level)
     stored = dict(zip(distinct, read, strict=True))
+    # Faces of one image share its decoded map.
     latest = lru_cache(maxsize=DECODED)(lambda name: stored[name].read())
     return [
         _layer_of(face, replace(stored[name], read=partial(latest, name)), view)
@@ -247,11 +250,11 @@ def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLa
 
 
 def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
-    """What a view shows of the masks of an image as it is; of a cube's face, only the masks that it shows."""
+    """What a view shows of a whole image's masks; a cube's face keeps only the masks that it shows."""
     _require_shape(view, layer, face.whole)
     scaled = face.of_whole_size(*layer.size)
     size = scaled.camera.width, scaled.camera.height
-    if not face.name:
+    if not face.name:  # the one view of an image shows all of its masks
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
     ids = scaled.mask_ids(layer.read())
     if (last := ids.max(initial=-1)) >= len(layer.features):
@@ -281,7 +284,8 @@ def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[M
 
 
 def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | None = None) -> Points:
-    """The points of a capture folder, or of the file given; fused from depth images where there is nothing else."""
+    """The points of a capture folder, or of the file given; fused from depth images where there is no other
+    geometry."""
     if gaussians is not None:
         return read_points(Path(gaussians))
     if poses.ply_file_path is not None:
@@ -299,7 +303,7 @@ def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | No
                 "in depth/: add one of them, or name a file (--gaussians)"
             )
         return _fused(capture, frames).points
-    if poses.source != model:  # which was often rotated, shifted or scaled since, and seldom says how
+    if poses.source != model:  # tools rotate, shift or scale COLMAP's world, and seldom say how
         raise SceneError(
             f"{poses.source} names no cloud, and the world of {model}/points3D may be another than that of its poses; "
             f"expected a cloud in the world of {poses.source.name}: add {CLOUD_NAMES[0]}, or remove "
@@ -350,13 +354,14 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
         if image.depth is not None:
             files[name] = image.depth
         elif path := find_depth(capture, name):
+            # Depth beside a distorted photograph is distorted alike; faces of a cube have depth images of their own.
             whole = image.face if image.face is not None and not image.face.name else None
             files[name] = DepthFile(path, whole.whole, lens=whole.lens) if whole else DepthFile(path, image.camera)
     return files
 
 
 def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
-    """What is fused: of a long recording so many frames, evenly, as show every surface often enough."""
+    """The frames that are fused: of a long recording every k-th, so that they are at most FUSED_FRAMES."""
     files = depth_files(capture, poses)
     images = dict(zip(poses.names, poses.images, strict=True))
     frames = []
@@ -368,7 +373,7 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 
 
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
-    from og_pointcloud.formats.fusion import doubtful_depth, fuse  # brings numba, which who has a cloud need not load
+    from og_pointcloud.formats.fusion import doubtful_depth, fuse  # loads numba, which captures with a cloud do without
 
     fused = fuse(frames)
     empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None

@@ -119,9 +119,10 @@ def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
 def _camera(
     camera_model: str, size: tuple[int, int], values: dict[str, float]
 ) -> tuple[Callable[[NDArray[np.float64]], Camera], Lens | None]:
-    """What makes the camera of a pose (world to camera), and the lens. values: by the names of the parameters."""
+    """A function from a pose (world to camera) to the camera, and the lens. values: by the names of the parameters."""
     if camera_model == "EQUIRECTANGULAR":
         return partial(spherical_camera, *size), SPHERICAL
+    # What is left of the values after focal lengths and principal point are the terms of the lens.
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
     model = "fisheye" if camera_model.endswith("FISHEYE") else LENS_MODELS.get(camera_model, "perspective")
@@ -133,7 +134,7 @@ def _camera(
 
 def _cameras_text(file: Path) -> Iterator[CameraRecord]:
     for place, line, _ in _lines(file):
-        words = [*line.split(), *[""] * 4]
+        words = [*line.split(), *[""] * 4]  # "" for fields that are missing: then it is no number, and says so
         (camera_id,), camera_model, size = _numbers(int, words[:1], place), words[1], _numbers(int, words[2:4], place)
         names = _parameters(file, camera_id, camera_model)
         values = _numbers(float, words[4 : 4 + len(names)], place)
@@ -141,7 +142,7 @@ def _cameras_text(file: Path) -> Iterator[CameraRecord]:
 
 
 def _images_text(file: Path) -> Iterator[ImageRecord]:
-    """Two lines each. The second, of 2-D points, is empty, but there, where an image has none."""
+    """Two lines each. The second lists 2-D points; it is empty, but there, where an image has none."""
     for place, line, lines in _lines(file):
         words = [*line.split(None, 9), *[""] * 10]
         if not words[9].strip():
@@ -149,7 +150,7 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
         _, camera_id = _numbers(int, [words[0], words[8]], place)
         yield _numbers(float, words[1:8], place), camera_id, words[9].strip()
         number, observations = next(lines, (0, ""))
-        if len(observations.split(None, 10)) == 10:  # ten words are an image, never threes
+        if len(observations.split(None, 10)) == 10:  # 2-D points come in threes, an image's line has ten words
             raise SceneError(
                 f"{file}, line {number}: found '{observations.strip():.60}'; expected the line of 2-D points that "
                 "follows each image, empty if it has none: export it again"
@@ -180,7 +181,7 @@ def _numbers(kind: Callable[[str], Number], words: Sequence[str], place: str) ->
 
 def _cameras_binary(file: Path) -> Iterator[CameraRecord]:
     source = _Binary(file)
-    for _ in range(source.count(24 + 3 * 8)):
+    for _ in range(source.count(24 + 3 * 8)):  # at least three parameters
         camera_id, model_id, width, height = source.unpack("<IiQQ")
         camera_model = MODEL_NAMES.get(model_id, f"of id {model_id}")
         names = _parameters(file, camera_id, camera_model)
@@ -190,10 +191,10 @@ def _cameras_binary(file: Path) -> Iterator[CameraRecord]:
 
 def _images_binary(file: Path) -> Iterator[ImageRecord]:
     source = _Binary(file)
-    for _ in range(source.count(4 + 7 * 8 + 4 + 1 + 8)):
+    for _ in range(source.count(4 + 7 * 8 + 4 + 1 + 8)):  # id, pose, camera, an empty name, number of 2-D points
         _, *pose, camera_id = source.unpack("<I7dI")
         yield tuple(pose), camera_id, source.name()
-        points = source.count(24)  # in the image: thousands, and nothing here needs them
+        points = source.count(24)  # 2-D points: thousands an image, which nothing here needs
         source.offset += 24 * points
 
 
@@ -207,7 +208,7 @@ class _Binary:
             self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
 
     def count(self, minimum_bytes: int) -> int:
-        """A number of records, checked against the bytes that are left before anything is made of it."""
+        """A number of records, checked against the bytes that are left before memory is taken for them."""
         count = self.unpack("<Q")[0]
         self.require(count * minimum_bytes)
         return count
@@ -227,6 +228,7 @@ class _Binary:
         return values
 
     def name(self) -> str:
+        """Text up to the zero byte that ends it."""
         end = self.data.find(b"\0", self.offset)
         self.require((end if end >= 0 else len(self.data)) + 1 - self.offset)
         name = self.data[self.offset : end].decode("utf-8", errors="replace")
@@ -242,13 +244,13 @@ TRACK_ELEMENT_BYTES = 8
 
 
 def _points_binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Records of unequal length (each ends in its track): the lengths are walked, the rest is gathered at once."""
+    """Records of unequal length, as each ends in its track: a loop finds where they start, numpy reads the rest."""
     source = _Binary(path)
     data, offsets = source.data, np.empty(source.count(POINT.itemsize), np.int64)
     last_start = len(data) - POINT.itemsize
     track_length = struct.Struct("<Q").unpack_from
     for row in range(len(offsets)):
-        if source.offset > last_start:
+        if source.offset > last_start:  # called only where it fails: there are millions of records
             source.require(POINT.itemsize)
         offsets[row] = source.offset
         source.offset += POINT.itemsize + TRACK_ELEMENT_BYTES * track_length(data, source.offset + TRACK_LENGTH_AT)[0]

@@ -1,7 +1,7 @@
 """Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
 
-16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are
-millimeters in a world of meters unless the data set says otherwise, stored floats are lengths of the world.
+16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are millimeters in a world of meters unless the
+data set says otherwise, stored floats are lengths of the world.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ MILLIMETRE = 1e-3
 
 @dataclass(frozen=True)
 class DepthImage:
-    """depth: (H, W) float32, lengths of the world along the optical axis, 0 unmeasured. camera: its own, of that size,
-    from world coordinates."""
+    """depth: (H, W) float32, in lengths of the world along the optical axis, 0 unmeasured. camera: its own, of that
+    size, its pose from world coordinates."""
 
     depth: NDArray[np.float32]
     camera: Camera
@@ -50,7 +50,7 @@ class DepthFile:
     lens: Lens | None = None
 
     def read(self) -> DepthImage:
-        """Decode, scale and undistort; of a lens that no pinhole can show, what lies in front.
+        """Decode, scale and undistort; of a lens that no pinhole can show, only what lies in front.
 
         SceneError names the file, what it holds and what was expected.
         """
@@ -93,8 +93,8 @@ def find_depth(capture: Path, name: str) -> Path | None:
 def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
     """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 where it does not look.
 
-    Two pinholes with one center and one orientation see a ray in columns and rows that depend on nothing but column
-    and row, so whole lines are picked, by nearest pixel: depths must not be blended over an edge.
+    Between two pinholes with one center and one orientation, a column depends on the column alone and a row on the row
+    alone, so whole lines are picked; by nearest pixel, as depths must not be blended over an edge.
     """
     columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
     rows = _positions(target.height, target.fy, target.cy, source.fy, source.cy)
@@ -106,6 +106,7 @@ def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
 
 
 def _positions(count: int, focal: float, center: float, source_focal: float, source_center: float) -> NDArray[np.intp]:
+    """(count,) the source's pixel, along one axis, at each of the target's pixels; outside of the image too."""
     along = (np.arange(count) + 0.5 - center) / focal
     return np.floor(along * source_focal + source_center).astype(np.intp)
 

@@ -2,7 +2,8 @@
 
 Poses take scans and images to the file's world. A pinhole image looks along -z, y up; a spherical one along +x, z up,
 and may end before the poles: it is filled up with black. Images without a pose, cylindrical ones, and those that only
-show the place (visual references) cannot be used. Read by pye57's libE57 (MIT, BSL), the extra 'e57'; it checks sums.
+show the place (visual references) cannot be used. Read by pye57's libE57 (MIT, BSL), the extra 'e57', which checks the
+file's checksums.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 CHUNK = 1 << 18
 """Points read at once."""
 MOST_POINTS_PER_BYTE = 8
-"""No file of any scanner packs more; one that claims to is hostile."""
+"""No scanner's file packs more; one that claims to is made to fill memory."""
 WHOLE_TURN = 0.02
-"""A spherical image spans 360 degrees to within this share."""
+"""A spherical image must span 360 degrees to within this share."""
 FROM_ALONG_X = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
@@ -157,6 +158,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, N
         raise SceneError(f"a scan claims {vector.childCount()} points, more than fit into the file: copy it again")
     colors = COLORS if fields.issuperset(COLORS) else ()
     wanted = [*places, *colors, *(name for name in INVALID if name in fields)]
+    # libE57 fills these arrays chunk by chunk, converted to float64 and scaled (the two True).
     arrays = {name: np.zeros(min(CHUNK, max(vector.childCount(), 1))) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
@@ -165,12 +167,13 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, N
     reader = vector.reader(buffers)
     while count := reader.read():
         valid = np.ones(count, np.bool_)
-        for name in INVALID:
+        for name in INVALID:  # 0: valid; 1, 2: only a direction, or nothing
             valid &= arrays[name][:count] == 0 if name in arrays else True
         xyz = np.column_stack([arrays[name][:count][valid] for name in places])
         xyz = xyz if places is CARTESIAN else _from_angles(*xyz.T)
         if pose is not None:
             xyz = xyz @ pose[:3, :3].T + pose[:3, 3]
+        # Each scan says which number is the brightest: 255 or 65535, say.
         scaled = [255 * arrays[name][:count][valid] / limit for name, limit in zip(colors, limits, strict=True)]
         rgb = np.clip(np.rint(np.column_stack(scaled)), 0, 255).astype(np.uint8) if colors else None
         parts += [(xyz, rgb)] if len(xyz) else []
@@ -179,6 +182,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, N
 
 
 def _from_angles(distance: Doubles, azimuth: Doubles, elevation: Doubles) -> Doubles:
+    """(n, 3) from range and radians: azimuth from x towards y, elevation above the xy plane."""
     flat = distance * np.cos(elevation)
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
 
@@ -207,11 +211,11 @@ def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, A
     suffix, data = _blob(shown, most)
     keys: dict[str, Any] = {"w": width, "h": height}
     if kind == "pinhole":
-        focal = _number(shown, "focalLength")
+        focal = _number(shown, "focalLength")  # a length, as pixelWidth is
         keys |= {"camera_model": "PINHOLE", "fl_x": focal / across, "fl_y": focal / along}
         keys |= {"cx": _number(shown, "principalPointX"), "cy": _number(shown, "principalPointY")}
     else:
-        data = _whole_sphere(data, suffix, (width, height), (across, along))
+        data = _whole_sphere(data, suffix, (width, height), (across, along))  # pixels span radians here
         pose[:3, :3] = pose[:3, :3] @ FROM_ALONG_X
         keys |= {"camera_model": "EQUIRECTANGULAR", "h": width // 2, "w": width // 2 * 2}
     write_file(folder / "images" / f"{name}{suffix}", data)
@@ -243,6 +247,7 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")
+    # The sphere is twice as wide as high; the image takes its share of the height, in the middle.
     whole = width // 2 * 2, width // 2
     shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))
     above = (whole[1] - shown) // 2

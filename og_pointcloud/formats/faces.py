@@ -1,8 +1,8 @@
 """An image of any lens becomes pinhole views: one, if a pinhole can show all that the lens saw, else faces of a cube.
 
-One view keeps the image's focal lengths and pose, and grows to the image's rim, which a view of the same size would
-crop. The faces of a cube are called front, left, right, up, down and back; those that the lens does not see are left
-out, the others cut to what it sees. Each has as many pixels across as the image has there.
+A single view keeps the image's focal lengths and pose, and extends to the image's rim, which a view of the same size
+would crop. The faces of a cube are called front, left, right, up, down and back; those that the lens does not see are
+left out, the others are cut to what it sees. Each has as many pixels across as the image has there.
 
 Masks are taken over by nearest pixel, since ids must not be blended. A pixel that the lens never saw is NOT_SEEN, which
 is no evidence of anything, while a pixel outside every mask says that no mask is there.
@@ -24,15 +24,15 @@ from og_pointcloud.scene import NOT_SEEN, Camera
 Doubles = NDArray[np.float64]
 
 ONE_VIEW = float(np.tan(np.radians(55)))
-"""A pinhole that looks wider than this, from its axis to a border, stretches its rim to more than three times."""
+"""Tangent of the angle from the axis to a border; a pinhole that looks wider stretches its rim more than threefold."""
 CIRCULAR = float(np.radians(85))
-"""A lens that sees as far as this from its axis towards the middle of a border draws a circle in the image."""
+"""A lens that sees as far as this from its axis towards the middle of a border draws a circle, with black corners."""
 LEAST_SHARE = 0.005
-"""Of a cube's face: less is not worth a view."""
+"""Share of a cube's face that the lens must see: less is not worth a view."""
 GRID = 257
-"""Rays a side by which it is looked up what a lens sees."""
+"""Rays a side on which it is tried what a lens sees."""
 CACHED_MAPS = 12
-"""Faces whose maps are kept, 4 bytes a pixel each: those of two cameras that are read in turn."""
+"""Faces whose maps are kept, 4 bytes a pixel each: those of two cameras whose images are read in turn."""
 CUBE = {
     "front": np.eye(3),
     "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -48,7 +48,8 @@ CUBE = {
 class Face:
     """A pinhole view of what a lens saw.
 
-    name: of the cube's face, "" for the one view. camera: the pinhole, with its pose. whole: of the image as it is.
+    name: of the cube's face, "" for a single view. camera: the pinhole, with its pose. whole: size, intrinsics and pose
+    of the distorted image, whose projection is ``lens``.
     """
 
     name: str
@@ -67,23 +68,26 @@ class Face:
         return replace(self, camera=self.camera.resized(*size), whole=self.whole.resized(width, height))
 
     def mask_ids(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
-        """The ids (h, w) of the image as it is -> (H, W) of this view, by nearest pixel; NOT_SEEN where it has none."""
+        """The ids (h, w) of the distorted image -> (H, W) of this view, by nearest pixel; NOT_SEEN where it has
+        none."""
         return self._picked(ids, NOT_SEEN)
 
     def depths(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """As `mask_ids`, of depths along this view's axis; 0 where the image has none."""
+        """As `mask_ids`, for depths along this view's axis; 0 where the image has none."""
         return self._picked(depth, 0)
 
     def _picked(self, values: NDArray, otherwise: int) -> NDArray:
         expected = (self.whole.height, self.whole.width)
         if values.shape != expected:
             raise SceneError(f"the map is {values.shape}; expected the camera's {expected} (rows, columns)")
-        # Where there is none, -1: the last.
+        # Pixels without a counterpart have the index -1, which takes the value appended here.
         return np.append(values, values.dtype.type(otherwise)).take(_nearest(self._key), mode="wrap")
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 of this view, linear, black where the lens saw nothing. rgb: (h, w, 3), the whole image."""
+        """(H, W, 3) uint8 of this view, by linear interpolation, black where the lens saw nothing. rgb: (h, w, 3), the
+        distorted image."""
         cv2 = require_cv2()
+        # OpenCV counts pixel centers at whole numbers. -2 lies outside of the image, and so is black.
         x, y = (np.nan_to_num(pixels - 0.5, nan=-2.0).astype(np.float32) for pixels in _pixels(self._key))
         border = cv2.BORDER_CONSTANT
         if self.lens.wraps:
@@ -127,14 +131,17 @@ def _numbers(camera: Camera) -> Numbers:
 
 @lru_cache(maxsize=64)
 def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
-    """By face, what is seen of it at depth 1. The one view is called "", and cut at whole pixels of the image."""
+    """By face, the box that is seen of it at depth 1. A single view is called "" and ends at whole pixels of the image."""
     width, height, fx, fy, cx, cy = whole
+    # A grid twice as wide as the undistorted image would be resolves a telephoto lens; a wide one may see more than
+    # that, and is tried again up to the widest single view.
     telephoto = 2 * max(abs(cx), abs(width - cx), 1.0) / fx, 2 * max(abs(cy), abs(height - cy), 1.0) / fy
     half = min(max(telephoto), ONE_VIEW)
     one, _ = _seen_box("front", whole, lens, half)
     if one is None or max(map(abs, one)) >= half:
         half = ONE_VIEW
         one, _ = _seen_box("front", whole, lens, half)
+    # A box that ends within the grid holds all that the lens sees.
     if one is not None and not lens.wraps and max(map(abs, one)) < half:
         left, top, right, bottom = (round(at * f + c) for at, f, c in zip(one, (fx, fy) * 2, (cx, cy) * 2, strict=True))
         right, bottom = max(right, left + 1), max(bottom, top + 1)
@@ -147,7 +154,8 @@ def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
 
 
 def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box | None, float]:
-    """Of a face that reaches from -half to half at depth 1: the box around what the lens sees of it, and its share."""
+    """For a face that reaches from -half to half at depth 1: the box around what the lens sees of it, and the share of
+    the face that it sees."""
     at = np.linspace(-half, half, GRID)
 
     def seen(x: Doubles, y: Doubles) -> NDArray[np.bool_]:
@@ -159,8 +167,9 @@ def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box |
         return None, 0.0
     borders = []
     for end, axis in ((0, 0), (0, 1), (-1, 0), (-1, 1)):  # left, top, right, bottom
+        # The border lies between the last line of the grid that is seen and the next one: there, on a finer grid.
         border = np.flatnonzero(coarse.any(axis=axis))[end]
-        beside = min(max(border + (1 if end else -1), 0), GRID - 1)  # the border lies before this one: looked up finer
+        beside = min(max(border + (1 if end else -1), 0), GRID - 1)
         fine = np.linspace(min(at[border], at[beside]), max(at[border], at[beside]), GRID)
         strip = seen(fine, at) if axis == 0 else seen(at, fine)
         borders.append(float(fine[np.flatnonzero(strip.any(axis=axis))[end]]))
@@ -168,23 +177,23 @@ def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box |
 
 
 def _image_pixels(rays: Doubles, whole: Numbers, lens: Lens) -> tuple[Doubles, Doubles]:
-    """Where rays (..., 3) of the camera meet the image as it is, pixel centres at +0.5; NaN where they do not."""
+    """Where rays (..., 3) of the camera meet the distorted image, pixel centers at +0.5; NaN where they do not."""
     width, height, fx, fy, cx, cy = whole
     u, v = lens.project(rays)
     reach = max(cx, width - cx) / fx, max(cy, height - cy) / fy
-    if max(reach) > lens.radius(CIRCULAR):  # of which the corners are black
+    if max(reach) > lens.radius(CIRCULAR):  # the corners of such an image are black: nothing was seen there
         beyond = np.hypot(u, v) > max(reach)
         u, v = np.where(beyond, np.nan, u), np.where(beyond, np.nan, v)
     with np.errstate(over="ignore", invalid="ignore"):  # far beyond the image
         u, v = u * fx + cx, v * fy + cy
-    if lens.wraps:
+    if lens.wraps:  # the whole sphere is in the image: rounding must not put the poles outside
         u, v = u % width, np.clip(v, 0, np.nextafter(height, 0))
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return np.where(inside, u, np.nan), np.where(inside, v, np.nan)
 
 
 def _pixels(key: _Key) -> tuple[Doubles, Doubles]:
-    """(H, W) each: column and row of the image as it is that every pixel of the face shows; NaN where it has none."""
+    """(H, W) each: column and row of the distorted image that each pixel of the face shows; NaN where it has none."""
     name, (width, height, fx, fy, cx, cy), whole, lens = key
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     return _image_pixels(np.stack([x, y, np.ones_like(x)], axis=-1) @ CUBE[name or "front"], whole, lens)
@@ -192,7 +201,7 @@ def _pixels(key: _Key) -> tuple[Doubles, Doubles]:
 
 @lru_cache(maxsize=CACHED_MAPS)
 def _nearest(key: _Key) -> NDArray[np.int32]:
-    """(H, W) int32: the nearest pixel of the image as it is, counted row by row; -1 where it has none."""
+    """(H, W) int32: the nearest pixel of the distorted image, counted row by row; -1 where it has none."""
     column, row = _pixels(key)
     with np.errstate(invalid="ignore"):
         flat = np.floor(row) * key[2][0] + np.floor(column)

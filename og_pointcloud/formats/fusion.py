@@ -3,15 +3,15 @@
 First pass: pixels that lie on a surface (flying pixels, between two, are left out) are averaged in voxels. Second pass:
 every view says of every voxel's point whether it measured that surface, looked through it, or could not see it. A point
 stays if more views confirm than refute it, and if two confirm it where three or more could have. It then moves to where
-the confirming views, on average, measured the surface: along each view's ray by the difference of the depths, one step
-to the surface that a signed distance volume would have there. So a noisy surface becomes one layer, and not as many as
-the noise fills voxels; what then shares a voxel is averaged once more.
+the confirming views, on average, measured the surface: along each view's ray by the difference of the depths, which is
+one step towards the surface of a signed distance volume. So a noisy surface becomes one layer instead of as many layers
+as the noise fills voxels; points that then share a voxel are averaged once more.
 
 The voxel follows from the images: two pixels wide at the median depth, and not finer than the noise with which views
 contradict each other.
 
-A check (`doubtful_depth`) tells at once what is otherwise seen hours later: where views overlap, a depth image of one
-predicts what the other measures; in the wrong unit it predicts another depth, unless the camera only turned.
+A check (`doubtful_depth`) finds mistakes before a fit of hours does: where views overlap, a depth image of one predicts
+what the other measures; in the wrong unit it predicts another depth, unless the camera only turned.
 """
 
 from __future__ import annotations
@@ -41,13 +41,16 @@ AGREEING = 0.02
 """Depths that differ by less than this share agree."""
 
 PIXELS_PER_VOXEL, NOISE_PER_VOXEL = 2.0, 1.0
+"""Edge of a voxel, in pixel widths and in standard deviations of the noise: the larger of the two."""
 GRAZING = 5.7
 """A surface's depth changes by at most so many pixel widths a pixel: it is seen 80 degrees off its normal (tan 80)."""
 STRAIGHT, BEND = 5, 0.25
-"""Readings in a row, more than sensors put between surfaces, that are of one if their inverse depths change evenly."""
+"""So many readings in a row, more than sensors put between two surfaces, are of one surface if the steps of their
+inverse depths differ by at most this share of the largest."""
 VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
 """A point and a measured depth of its surface may lie so many voxels, or deviations of the noise, apart."""
 ROUNDS = 2
+"""Times that all views judge and move the points."""
 VOXELS_ACROSS = 1 << 21
 """Along each axis, so that a voxel's three indices fit one 64-bit key."""
 
@@ -56,16 +59,17 @@ COMPARED = 12
 UNITS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
 """Factors between units in use: meters, centimeters, millimeters, 1/4000 and 1/5000 m against 1/1000 m."""
 LEAST_AGREEING, LEAST_COMPARABLE = 0.2, 0.35
-"""Shares of depths that agree, and that differ little enough for one surface, below which images are no depths of one
-place: right ones agree in about half of the places, the rest is hidden in one view."""
+"""If smaller shares of the depths agree, and differ little enough for one surface, the images are no depths of one
+place. Right ones agree in about half of the places; the rest is hidden in one of the views."""
 CONVINCING = 0.3
-"""How much larger a share of agreeing depths must become for another unit to be named."""
+"""Another unit is named if it makes the share of agreeing depths larger by this."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What some frames say of all. depth: median measured depth. footprint: width of a pixel on what it sees, median.
-    noise: standard deviation between two views' depths of one surface, 0 where no two views overlap."""
+    """Measured on some frames, taken for all. depth: median measured depth. footprint: median width of a pixel on what
+    it sees.
+    noise: standard deviation of one view's depths of a surface, 0 where no two views overlap."""
 
     depth: float
     footprint: float
@@ -100,6 +104,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
     Raises SceneError where no frame measures anything, or a file cannot be read.
     """
     found = survey(frames)
+    # Among the cameras: voxels are counted from there, and few enough in each direction to fit their key.
     origin = np.median([frame.depth.camera.center for frame in frames], axis=0)
     voxels = _Voxels(found.voxel)
     empty = []
@@ -143,7 +148,8 @@ def survey(frames: Sequence[DepthFrame]) -> Survey:
     typical = float(np.median(np.concatenate(depths)))
     off = np.abs(_differences(images))
     comparable = off[off < COMPARABLE]
-    # 1.4826: median of the absolute value to standard deviation; two views' noise differs by the root of two.
+    # 1.4826: from the median of absolute values to a standard deviation. The difference of two views has the noise of
+    # both, the root of two times that of one; it is relative, so that it counts at the typical depth.
     noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
     return Survey(typical, float(np.median(np.concatenate(widths))), float(noise))
 
@@ -155,15 +161,18 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
 
 
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
-    """(H, W) bool: every ``step``-th reading along each axis that is, in its row and in its column, of one surface with
-    a neighbor; slanted: or, at more of a slant, with STRAIGHT readings that it is one of. A map knows what its frames
-    measured; in a fused cloud such points would hide each other from a fit."""
+    """(H, W) bool: of every ``step``-th reading along each axis those that lie, in their row and in their column, on
+    one surface with a neighbor. slanted: readings on a surface seen at a flatter angle count too, if they are one of
+    STRAIGHT on a line. A map takes these, as it knows what its frames measured; in a fused cloud such points would hide
+    each other from a fit."""
     steepest = GRAZING / image.camera.fx, GRAZING / image.camera.fy
     return _on_surface(image.depth, step, steepest, NOISE_TOLERANCE * noise, slanted)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
+    """See `on_surface`. steepest: change of depth a pixel, as a share of it, along rows and columns; slack: beside
+    it."""
     height, width = depth.shape
     chosen, none = np.zeros(depth.shape, np.bool_), np.float32(0)
     for row in range(step // 2, height, step):
@@ -171,6 +180,8 @@ def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
             z = depth[row, column]
             if z <= 0:
                 continue
+            # A flying pixel lies between two surfaces: near neither neighbor along the axis across their edge. An image
+            # of one column or row has no such neighbors.
             left = depth[row, column - 1] if column > 0 else none
             right = depth[row, column + 1] if column < width - 1 else none
             across = width == 1 or _near(z, left, steepest[0], slack) or _near(z, right, steepest[0], slack)
@@ -201,6 +212,7 @@ def _straight(line, k):  # noqa: ANN001, ANN202
             change = 1 / line[j + 1] - 1 / line[j]
             low, high = min(low, change), max(high, change)
         else:
+            # All steps have one sign (else the bound is below 0), and are about equal.
             if high - low <= BEND * max(low, -high):
                 return True
     return False
@@ -219,7 +231,8 @@ def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) 
 
 
 def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
-    """Relative differences between depths of some pixels and what the other images measured at the same places."""
+    """Relative differences between depths of some pixels and what the other images measured at the same places, all
+    depths taken times ``factor``."""
     found = [np.zeros(0)]
     for index, image in enumerate(images):
         sampled = np.zeros(image.depth.shape, bool)
@@ -251,14 +264,14 @@ def _judge(
         image = frame.depth.read()
         camera = image.camera
         surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
-        # Looked through only if all pixels around did: a thin thing half a pixel off is still there.
+        # A view looks through a point only if all pixels around do: a thin thing half a pixel off is still there.
         nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
         seen_from = camera.world_to_camera[:3, :3], camera.center - origin, (camera.fx, camera.fy, camera.cx, camera.cy)
         depths, limits = (image.depth, surface, nearest), (found.tolerance, found.depth)
         _add_votes(xyz, seen_from, depths, limits, votes, shift)
     confirmed, refuted, could_see = votes.T
     stays = (confirmed > refuted) & (confirmed >= np.where(could_see >= 3, 2, 1))
-    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)
+    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)  # weight 0: no shift either
 
 
 @njit(cache=True, parallel=True)
@@ -282,13 +295,16 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
         if not (0 <= column < width and 0 <= row < height):
             continue
         v, u = int(row), int(column)
-        # Noise and pixels grow with depth.
+        # Noise and the width of pixels grow with depth.
         allowed = tolerance * max(1.0, along / typical)
+        # It could see the point if it measured nothing in front of it, and refutes it if all around lies behind it.
         votes[i, 2] += depth[v, u] >= along - allowed
         votes[i, 1] += nearest[v, u] > along + allowed
         difference = surface[v, u] - along
         if surface[v, u] > 0 and abs(difference) <= allowed:
             votes[i, 0] += 1
+            # (x, y, z) / along is the ray to the depth 1, so that the point moves to the measured depth. Nearer views
+            # measure better: by the inverse square of the depth.
             weight = 1.0 / (along * along)
             shift[i, 0] += weight * difference * x / along
             shift[i, 1] += weight * difference * y / along
@@ -297,7 +313,8 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
 
 
 class _Voxels:
-    """Mean position and color by voxel: sums by key, ascending, and the points that wait to be added to them."""
+    """Mean position and color by voxel. _merged: the keys, ascending, and of each the sums of x, y, z, r, g, b and the
+    number of points; _waiting: points that are not added to these yet."""
 
     def __init__(self, edge: float) -> None:
         self._edge = edge
@@ -315,7 +332,7 @@ class _Voxels:
         x, y, z = (np.floor(xyz / self._edge).astype(np.int64) + VOXELS_ACROSS // 2).T
         keys = (x * VOXELS_ACROSS + y) * VOXELS_ACROSS + z
         self._waiting.append((keys, np.column_stack([xyz, rgb, np.ones(len(xyz))])))
-        # Merged when as much waits as is there: every voxel is then sorted a few times, not once a frame.
+        # Merged only once as many wait as are there: a voxel is then sorted a few times, not once a frame.
         if sum(len(keys) for keys, _ in self._waiting) > len(self._merged[0]):
             self._merge()
 
@@ -339,8 +356,8 @@ def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], 
 
 
 def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
-    """What is said, with the cure, where views agree clearly better if all depths are taken in another unit, or in no
-    unit."""
+    """A warning, with the cure, where views agree clearly better if all depths are taken in another unit, or agree in
+    no unit; None where neither is so."""
     images = [image for frame in evenly(frames, COMPARED) if (image := frame.depth.read()).depth.any()]
     shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNITS)}
     best = max(UNITS, key=shares.__getitem__)
@@ -354,7 +371,7 @@ def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
 
 
 def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
-    """What is said where views overlap and agree in no unit. share: of depths that agree, in the best unit."""
+    """A warning where views overlap and agree in no unit. share: of depths that agree in the best unit."""
     roughly = _agreement(images, 1.0, COMPARABLE)
     if share >= LEAST_AGREEING or not roughly < LEAST_COMPARABLE:  # also where no views overlap
         return None

@@ -49,7 +49,7 @@ def gaussian_rows(points: Points) -> NDArray[np.void]:
     """
     scale, rotation, opacity = points.gaussians
     smallest = np.finfo(np.float32).smallest_normal
-    # 2^-24 below 1 is the last opacity under 1 that float32 knows.
+    # 1 - 2^-24 is the largest float32 below 1.
     opacity = np.clip(opacity.astype(np.float64), 2.0**-24, 1 - 2.0**-24)
     rgb = np.full(points.xyz.shape, 127.5) if points.rgb is None else points.rgb
     groups = {
@@ -125,6 +125,7 @@ def _compressed(elements: Elements) -> Points:
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
     # Two bits name the largest of w, x, y, z; the others have ten each, of +-1/sqrt(2).
+    # The largest part of a unit quaternion follows from the others, and none of these exceeds 1/sqrt(2).
     others = (_unpack(words["packed_rotation"], bits=(2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
     rotation = from_smallest_three(words["packed_rotation"] >> 30, others)
     return activated(xyz, scale, rotation, rgba[:, 3], color)
@@ -142,7 +143,7 @@ def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> 
 
 
 def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``share`` of the way from each splat's chunk minimum to its maximum."""
+    """(n, len(names)) values at ``share`` of the way from the minimum to the maximum of each splat's chunk."""
     minimum, maximum = (stack_columns(chunk, [f"{end}_{name}" for name in names]) for end in ("min", "max"))
     of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
     with np.errstate(invalid="ignore"):  # infinite bounds give NaN, which is reported as such
@@ -150,7 +151,8 @@ def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.
 
 
 def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 4) unit quaternions. largest: (n,) place of the largest part, which is positive; others: (n, 3), in order."""
+    """(n, 4) unit quaternions. largest: (n,) place of the largest part, which is positive; others: (n, 3), the other
+    parts in their order."""
     quaternions, is_largest = np.empty((len(others), 4)), np.arange(4) == largest[:, None]
     quaternions[is_largest] = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
     quaternions[~is_largest] = others.ravel()
@@ -164,11 +166,13 @@ def activated(
     opacity: NDArray[np.float64],
     color: NDArray[np.float64] | None,
 ) -> Points:
-    """Points from activated values, quaternions (n, 4) of any length, and colors around [0, 1]; finite or an error."""
+    """Points from activated values, quaternions wxyz (n, 4) of any length, and colors around [0, 1], which are clipped.
+    SceneError where a value is not finite."""
     parts = {"position": xyz, "scale": scale, "rotation": rotation, "opacity": opacity[:, None]}
     if color is not None:
         parts["color"] = color
     if not all(np.isfinite(values).all() for values in parts.values()):
+        # Only now by row: which Gaussian is the first, and what in it.
         finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
         usable = np.logical_and.reduce(list(finite.values()))
         first = int(np.argmin(usable))
@@ -178,7 +182,7 @@ def activated(
             f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
         )
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    # A zero quaternion put into the rotation matrix formula gives the identity, so that is how such files are rendered.
+    # The rotation matrix formula gives the identity for a zero quaternion: so renderers show such splats unrotated.
     unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
     rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
     return Points.from_world(

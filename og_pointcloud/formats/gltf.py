@@ -1,9 +1,9 @@
 """Labelled clouds and splats as glTF 2.0, binary (.glb). Out only.
 
-Points with colors, splats with what KHR_gaussian_splatting adds (viewers without it draw points), label and instance as
-feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1), their names in property tables
-(EXT_structural_metadata), which Cesium shows for a picked feature and styles by; score and reason as attributes of our
-own, names in the mesh's extras too.
+Points have colors, splats also what KHR_gaussian_splatting adds (viewers without it draw points). Label and instance
+are feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1), with their names in property tables
+(EXT_structural_metadata), which Cesium shows for a picked feature and styles by. Score and reason are attributes of our
+own; names stand in the mesh's extras too.
 
 Format: Khronos, "glTF 2.0 Specification", and the extensions' texts.
 """
@@ -36,7 +36,7 @@ SPLATS = "KHR_gaussian_splatting"
 SPLATS_AS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 """How splats are trained: sRGB colors as they are shown."""
 ALIGNMENT = 8
-"""Of all that lies in the buffer: property tables need it, columns half of it."""
+"""Bytes, of all that lies in the buffer: property tables need 8, columns of vertices 4."""
 NAME = "name"
 """The property of both tables: a label's name, and the name of an instance's label."""
 
@@ -70,7 +70,7 @@ def write_gltf(
         columns = {"POSITION": (xyz_world - origin).astype(np.float32), "COLOR_0": _linear_colors(rgb, splats)}
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
         for index, (name, texts) in enumerate(tables.items()):
-            ids = attributes[name]
+            ids = attributes[name]  # below 0 becomes the null feature id, one beyond the last
             columns[f"_FEATURE_ID_{index}"] = np.where(ids >= 0, ids, len(texts)).astype(np.float32)
         columns["_OG_SCORE"] = attributes["og_score"].astype(np.float32)
         columns["_OG_REASON"] = attributes["og_reason"].astype(np.float32)
@@ -89,7 +89,7 @@ class _Buffer:
         self.views: list[dict[str, int]] = []
 
     def add(self, data: bytes, **more: int) -> int:
-        """The number of the view of this data. more: what else it says."""
+        """Append data, aligned, and return the number of its view. more: further entries of the view."""
         self.data += bytes(-len(self.data) % ALIGNMENT)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
         self.data += data
@@ -111,7 +111,9 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
 
 
 def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.uint16]:
-    """(n, 4) sRGB -> linear, opaque, or as the splats are. 16 bits, since 8 linear ones would lose the dark colours."""
+    """(n, 4) uint16 linear color and opacity, 1 without splats. 16 bits, as 8 linear ones would lose the dark
+    colors."""
+    # The transfer function of sRGB, IEC 61966-2-1.
     share = np.arange(256) / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     table = np.rint(linear * 65535).astype(np.uint16)
@@ -126,7 +128,7 @@ def _document(
     names: Sequence[str],
     buffer: _Buffer,
 ) -> dict[str, Any]:
-    """The JSON document of one mesh, whose columns go into the buffer."""
+    """The JSON document of one mesh with one set of points; its columns are appended to the buffer."""
     accessors = [_accessor(buffer, column, with_bounds=name == "POSITION") for name, column in columns.items()]
     attributes = {name: index for index, name in enumerate(columns)}
     primitive = {"attributes": attributes, "mode": POINTS_MODE, "extensions": extensions}
@@ -142,7 +144,8 @@ def _document(
 
 
 def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> list[str]:
-    """The name of each instance's label, "" where it has none; instances come from one choice, so any point tells."""
+    """The name of each instance's label, "" where it has none. All points of an instance have one label: the first of
+    each is read."""
     ids, labels = attributes["og_instance"], attributes["og_label"]
     named = [""] * (int(ids.max(initial=-1)) + 1)
     present, first = np.unique(ids, return_index=True)
@@ -180,7 +183,7 @@ def _feature_sets(
 
 
 def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
-    """What a document says of a column, which goes into the buffer."""
+    """The document's entry for a column, whose data is appended to the buffer."""
     little_endian = column.astype(column.dtype.newbyteorder("<"), copy=False)
     accessor: dict[str, Any] = {
         "bufferView": buffer.add(little_endian.tobytes(), target=ARRAY_BUFFER),
@@ -196,6 +199,8 @@ def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[st
 
 
 def _as_glb(document: Mapping[str, Any], buffer: _Buffer) -> bytes:
+    """Binary glTF (section 4 of the specification): a header of 12 bytes, then a JSON and a binary chunk. Chunks are
+    multiples of 4 bytes, JSON filled up with spaces, binary with zeros."""
     binary = bytes(buffer.data) + bytes(-len(buffer.data) % 4)
     whole = {**document, "bufferViews": buffer.views, "buffers": [{"byteLength": len(binary)}]}
     text = json.dumps(whole, separators=(",", ":")).encode()

@@ -21,7 +21,7 @@ IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
 MOST_SEGMENTS = 1000
-"""Within which a JPEG says how large it is."""
+"""Segments of a JPEG among which its size must stand."""
 
 
 class PngHeader(NamedTuple):
@@ -116,7 +116,7 @@ def stated_size(stream: BinaryIO) -> tuple[int, int] | None:
 
 
 def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """That of the first frame header. Segments before it are skipped by their lengths (ITU-T T.81, B.1)."""
+    """The size in the first frame header. Segments before it are skipped by their lengths (ITU-T T.81, B.1)."""
     stream.seek(2)
     for _ in range(MOST_SEGMENTS):
         marker = stream.read(4)
@@ -124,21 +124,23 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
             marker = marker[1:] + stream.read(1)
         if len(marker) < 4 or marker[0] != 0xFF:
             return None
+        # Frame headers, SOF0 to SOF15; C4, C8 and CC in between are tables (DHT, DAC) and reserved (JPG).
         if marker[1] in range(0xC0, 0xD0) and marker[1] not in (0xC4, 0xC8, 0xCC):
-            frame = stream.read(5)
+            frame = stream.read(5)  # precision, height, width
             return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
         stream.seek(int.from_bytes(marker[2:], "big") - 2, os.SEEK_CUR)
     return None
 
 
 def _webp_size(head: bytes) -> tuple[int, int] | None:
-    """Of a lossy (VP8), lossless (VP8L) or extended (VP8X) file."""
-    if head[12:16] == b"VP8 ":
+    """The size in a lossy (VP8, RFC 6386 9.1), lossless (VP8L) or extended (VP8X, RFC 9649) file."""
+    if head[12:16] == b"VP8 ":  # 14 bits each; the upper two scale the display
         width, height = struct.unpack_from("<HH", head, 26)
         return width & 0x3FFF, height & 0x3FFF
-    if head[12:16] == b"VP8L":
+    if head[12:16] == b"VP8L":  # 14 bits each, less one
         bits = int.from_bytes(head[21:25], "little")
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    # 24 bits each, less one.
     sizes = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
     return sizes if head[12:16] == b"VP8X" else None
 
@@ -154,7 +156,7 @@ def _tiff_size(stream: BinaryIO, head: bytes) -> tuple[int, int] | None:
     size: dict[int, int] = {}
     for at in range(0, len(entries) - 11, 12):
         tag, kind = struct.unpack_from(order + "HH", entries, at)
-        size[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), entries, at + 8)[0]
+        size[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), entries, at + 8)[0]  # 3: SHORT, else LONG
     return (size[256], size[257]) if {256, 257} <= size.keys() else None
 
 

@@ -79,6 +79,7 @@ def _sensor(file: Path, camera: str) -> tuple[Sensor, NDArray[np.float64]]:
     parts = (line.partition(":") for line in read_text(file).splitlines())
     lines = {key: numbers for key, _, numbers in parts}
     width, height = _stated(lines, f"S_rect_{camera}", 2, file)
+    # P = K [I | t] for points of the left camera's frame: its last column holds fx t_x, and the camera stands at -t_x.
     projection = np.reshape(_stated(lines, f"P_rect_{camera}", 12, file), (3, 4))
     sensor = Sensor.from_matrix((round(width), round(height)), projection)
     beside = -projection[0, 3] / (projection[0, 0] or 1.0)  # the camera refuses a focal length of 0

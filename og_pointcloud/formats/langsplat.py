@@ -35,8 +35,8 @@ LANGSPLAT_WIDTH = 512
 def read_language_features(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
     """The masks of these views at one level and the name of their feature space.
 
-    Each id map is looked through once here (which rows does the level use?) and read again when its layer is. Raises
-    SceneError where a file is missing, an id has no feature row, or no view has a mask at this level.
+    Each id map is read here once, to find the rows that the level uses, and again when its layer is. Raises SceneError
+    where a file is missing, an id has no feature row, or no view has a mask at this level.
     """
     if level not in LEVELS:
         raise SceneError(f"mask level is '{level}'; expected one of {', '.join(LEVELS)}")
@@ -69,7 +69,7 @@ def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
             f"{id_file}: mask id {highest} of level '{level}' has no feature row ({feature_file.name} has "
             f"{len(features)}): write both files in one run"
         )
-    used = np.flatnonzero(np.bincount(ids.reshape(-1) + 1, minlength=1)[1:])
+    used = np.flatnonzero(np.bincount(ids.reshape(-1) + 1, minlength=1)[1:])  # without id -1
     row_of_id = np.full(highest + 2, -1, np.int32)  # the last entry serves id -1
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
     height, width = ids.shape
@@ -95,6 +95,7 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
         ids = stored.astype(np.int32)
     if (ids != stored).any():
         raise SceneError(f"{file}: level '{level}' holds values that are no ids; expected whole numbers, -1 for none")
+    # Id 0 is the first mask of the first level that has any.
     if index and (ids == 0).any() and (levels[:index] >= 0).any():
         raise SceneError(
             f"{file}: the ids of level '{level}' start at 0 again; expected ids that count on from level to level, as "

@@ -4,9 +4,9 @@ Out: LAS 1.4, with labels where each kind of reader looks for them: ``classifica
 og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud. Points of a
 file keep all that it says of them, and its coordinate system; others are of point format 7.
 
-Before a file is read, what its header counts is held against its size: laspy reads as many records as the header says,
-if need be four billion empty ones, and lazrs makes room for every chunk and layer that a LAZ file announces, and ends
-the process where there is none.
+Before a file is read, the counts in its header are checked against its size: laspy reads as many records as the header
+says, if need be four billion empty ones, and lazrs takes memory for every chunk and layer that a LAZ file announces,
+and ends the process where there is not enough.
 
 Format: ASPRS, "LAS Specification 1.4 R15"; Isenburg, "LASzip: lossless compression of LiDAR data", 2013.
 """
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 SIGNATURE = b"LASF"
 POINTS_PER_CHUNK = 1_000_000
-"""Read at once: a header that promises more points than the file holds never makes room for them."""
+"""Read at once, so that memory follows the points in the file and not those that its header promises."""
 UNLABELLED = 1
-"""Class "processed, but unclassified"; also of labels beyond the last class that is free."""
+"""Class "processed, but unclassified"; labels beyond the last free class have it too."""
 FIRST_FREE_CLASS, LAST_CLASS = 64, 255
 """Classes that the format leaves to its users: label k is class 64 + k."""
 STEPS_PER_EXTENT = 1e8
@@ -45,11 +45,12 @@ STEPS_PER_EXTENT = 1e8
 FULL_RANGE = 257
 """An 8-bit color times this spans the format's 16 bits."""
 EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
-"""Point formats before LAS 1.4 have 32 classes; the formats that hold all that they do."""
+"""Point formats before LAS 1.4 have 32 classes only: for each, the later format that holds all that it does."""
 OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 LONGEST_RECORD = 65_535
 SMALLEST_HEADER, RECORD_HEADER, LAST_RECORD_HEADER = 227, 54, 60
+"""Bytes of the header of LAS 1.0 to 1.2, and of that of each variable length record, before and behind the points."""
 LAYERED = 3
 """LASzip's compressor whose chunks hold each field as a layer of its own."""
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
@@ -156,7 +157,7 @@ def _opened(path: Path) -> Iterator[Any]:
     with naming(path):
         try:
             _check_counts(path)
-            # Of the two backends this one makes no room for points that a chunk only claims to have.
+            # Of laspy's two backends this one takes no memory for points that a chunk only claims to have.
             with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
                 yield reader
         except (SceneError, OSError, KeyboardInterrupt, SystemExit):
@@ -191,6 +192,7 @@ def _check_counts(path: Path) -> None:
     size = path.stat().st_size
     _require(size >= SMALLEST_HEADER, f"a file of {size} bytes has no whole header")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        # Before laspy parses the header: it reads as many records as this says.
         header_size, first_point, records, _, point_size = struct.unpack_from("<HIIBH", data, 94)
         _require(header_size + RECORD_HEADER * records <= first_point <= size, f"{records} records before the points")
         header = _laspy().LasHeader.read_from(file)
@@ -208,7 +210,8 @@ def _require(fits: bool, what: str) -> None:
 
 
 def _layers(laszip_records: Sequence[Any]) -> int:
-    """Number of layers of a point, 0 where the points are not layered."""
+    """Number of layers of a point, 0 where the points are not layered. The LASzip record: the compressor (uint16), 30
+    bytes of versions and sizes, the number of items (uint16), and of each item its type, size and version."""
     _require(bool(laszip_records), "compressed points without a LASzip record")
     content = laszip_records[0].record_data
     _require(len(content) >= 34, f"a LASzip record of {len(content)} bytes")
@@ -228,9 +231,10 @@ def _check_last_records(data: mmap.mmap, at: int, records: int) -> None:
 
 
 def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: int) -> None:
-    """The chunks lie one behind the other, and then comes their table, which says how many there are.
+    """SceneError where chunks reach beyond the file. First comes the place of their table, then the chunks, one behind
+    the other, then the table, which says how many there are.
 
-    A layered chunk: its first point, its number of points, the lengths of its layers, the layers.
+    A layered chunk holds its first point, its number of points, the lengths of its layers, and the layers.
     """
     _require(first_point + 8 <= len(data), "a chunk table beyond the end")
     table, at, chunks = struct.unpack_from("<q", data, first_point)[0], first_point + 8, 0
@@ -243,6 +247,7 @@ def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: in
         at = sizes + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, sizes))
         _require(at <= table, f"layers of chunk {chunks} beyond the chunk table")
         chunks += 1
+    # Chunks without layers do not say how long they are: there are no more than bytes.
     counted = struct.unpack_from("<I", data, table + 4)[0]
     _require(counted == chunks if layers else counted <= table - at, f"a table of {counted} chunks")
 
@@ -253,7 +258,8 @@ def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
 
 
 def _grid(xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offset and step, a power of ten, of the counts that stand for coordinates; no count leaves 32 bits."""
+    """Offset and step, a power of ten, of the counts that stand for coordinates: at most 10^9 of them, which fit 32
+    bits."""
     if not len(xyz_world):
         return np.zeros(3), np.full(3, 1e-3)
     offset = np.floor(xyz_world.min(axis=0))

@@ -30,11 +30,11 @@ Doubles = NDArray[np.float64]
 Terms = Mapping[str, float]
 
 ANGLES = np.linspace(0.0, np.pi, 4097)[:-1]
-"""At which it is looked up how far out a lens sees."""
+"""Angles from the axis, radians, at which it is tried how far out a lens sees."""
 
 
 def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
-    z = z + t["xi"] * np.sqrt(x * x + y * y + z * z)
+    z = z + t["xi"] * np.sqrt(x * x + y * y + z * z)  # the unified model; a plain pinhole for xi = 0
     x, y = x / z, y / z
     r2 = x * x + y * y
     radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * (t["k3"] + r2 * t["r8"])))
@@ -42,6 +42,7 @@ def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles,
 
 
 def _fisheye(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    # (x, y) to the length theta; on the axis both are 0, whatever the scale.
     radius = np.hypot(x, y)
     scale = np.arctan2(radius, z) / np.maximum(radius, np.finfo(np.float64).tiny)
     x, y = x * scale, y * scale
@@ -52,6 +53,7 @@ def _fisheye(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Dou
 
 
 def _tangential(x: Doubles, y: Doubles, r2: Doubles, radial: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    """Brown's decentering on top of the radial factor, in OpenCV's order of p1 and p2."""
     p1, p2 = t["p1"], t["p2"]
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -61,13 +63,14 @@ def _tangential(x: Doubles, y: Doubles, r2: Doubles, radial: Doubles, t: Terms) 
 
 def _fov(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
     radius = np.hypot(x, y)
-    bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]
+    bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]  # arctan2: rays to the side and behind too
     scale = bent / np.maximum(radius, np.finfo(np.float64).tiny)
     return x * scale, y * scale
 
 
 def _division(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
     x, y = x / z, y / z
+    # r = d / (1 + k d^2) solved for d, the root that is r for k = 0; in this form it holds there, too.
     scale = 2 / (1 + np.sqrt(1 - 4 * t["k"] * (x * x + y * y)))
     return x * scale, y * scale
 
@@ -114,8 +117,8 @@ class Lens:
         return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
 
     def radius(self, angle: float) -> float:
-        """Of the circle that rays at this angle from the axis, radians, meet; infinite where the lens sees none of
-        them, or draws no circles."""
+        """Radius of the circle on which rays at this angle from the axis, radians, meet the image; infinite where the
+        lens does not see them, or draws no circles."""
         u, _ = self.project(np.array([np.sin(angle), 0.0, np.cos(angle)]))
         return np.inf if self.wraps or np.isnan(u) else float(u)
 
@@ -129,8 +132,8 @@ SPHERICAL = Lens("spherical", ())
 
 @lru_cache(maxsize=64)
 def widest(lens: Lens) -> float:
-    """The angle from the axis, radians, up to which radii grow: beyond, a polynomial turns back and would show the
-    image's inside once more, and rays to the side or behind pass a perspective lens by."""
+    """The angle from the axis, radians, up to which a lens sees: as long as radii grow. Beyond, a polynomial turns back
+    and would show the inside of the image once more; and a perspective lens has no rays to the side or behind."""
     if lens.wraps:
         return np.inf
     with np.errstate(all="ignore"):

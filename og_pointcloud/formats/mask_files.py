@@ -1,10 +1,10 @@
 """The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
 
-A mask image is gray, 8 or 16 bit, or has a palette, whose colors say nothing; it holds 0 outside every mask, else an
-id 1..M that means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type,
-where row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero
-image and an empty (0, D) array. Masks that a tracker followed have ``<view name>.tracks`` -> (M,) whole numbers there:
-the same in all views for what it took for one thing, -1 unknown.
+A mask image is gray, 8 or 16 bit, or has a palette, whose colors say nothing. It holds 0 outside every mask, else an id
+1..M, which means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type, where
+row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero image
+and an empty (0, D) array. For masks that a tracker followed it holds ``<view name>.tracks`` -> (M,) whole numbers: the
+same number in all views for what the tracker took for one thing, -1 unknown.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ def _read_features(
 
 
 def as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:
-    """(masks, width) of a file; what overflows becomes infinite, which the scene reports by mask. SceneError, which
-    begins with ``source``, for anything but floats of that shape."""
+    """(masks, width) float32 of what a file holds. Values beyond float32 become infinite, which the scene reports by
+    mask. SceneError, which begins with ``source``, for anything but floats of that shape."""
     if values.size == 0:
         return np.zeros((0, values.shape[-1] if values.ndim == 2 else 0), np.float32)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):

@@ -50,7 +50,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         raise SceneError(
             f"{file} has no list 'frames' with at least one frame; expected nerfstudio's or instant-ngp's layout"
         )
-    shared = {key: value for key, value in content.items() if key != "frames"}
+    shared = {key: value for key, value in content.items() if key != "frames"}  # a frame's own keys override these
     images, dropped = [], []
     for index, frame in enumerate(frames):
         path = frame.get("file_path") if isinstance(frame, dict) else None
@@ -96,10 +96,10 @@ def _camera(
 ) -> Camera:
     w, h, cx, cy = (_number(keys, key) for key in ("w", "h", "cx", "cy"))
     width, height = image_size() if w is None or h is None else (round(w), round(h))
-    if _camera_model(keys) in SPHERICAL_MODELS:  # whatever fl_x says: writers disagree
+    if _camera_model(keys) in SPHERICAL_MODELS:  # whatever fl_x says: writers disagree on what it is of a sphere
         return spherical_camera(width, height, world_to_camera)
     fx = _focal(keys, "x", width)
-    fy = _focal(keys, "y", height)
+    fy = _focal(keys, "y", height)  # Blender states the angle over the width alone: pixels are square then
     if fx is None:
         raise SceneError("neither fl_x (pixels) nor camera_angle_x (radians) is given; expected one of them")
     return Camera(
@@ -154,7 +154,7 @@ def _camera_model(keys: dict[str, Any]) -> str:
 def _lens(keys: dict[str, Any]) -> Lens | None:
     """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all terms given count."""
     model = _camera_model(keys)
-    other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # lenses of instant-ngp
+    other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # other lenses of instant-ngp
     known = PERSPECTIVE_MODELS + FISHEYE_MODELS + SPHERICAL_MODELS
     if model not in known or other:
         raise SceneError(

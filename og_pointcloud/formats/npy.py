@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
 LONGEST_HEADER = 1 << 17
-"""Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
+"""Bytes in which a header must end; numpy reads none of more than 10,000 characters."""
 LAST_CHARACTER = 0x10FFFF
+"""The last code point of Unicode."""
 MOST_RATIO, PLENTY = 200, 1 << 26
-"""How many times its bytes a file may unpack to, and the bytes that any may. Vectors hardly shrink, masks by 100."""
+"""A file may unpack to so many times its own bytes, or to so many bytes. Vectors hardly shrink, masks by 100."""
 
 
 def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
@@ -35,13 +36,14 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
         raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")
-    count = int(np.prod(shape, dtype=object))
+    count = int(np.prod(shape, dtype=object))  # Python's integers do not overflow
     claimed, held = count * dtype.itemsize, len(data) - stream.tell()
     if any(length < 0 for length in shape) or claimed != held or (count and not dtype.itemsize):
         raise ValueError(f"its header claims {dtype} {shape}, {claimed} bytes, but {held} follow")
     if claimed == 0:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
+    # Otherwise an error would come later, without the file's name, where numpy makes strings of the numbers.
     if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CHARACTER).any():
         raise ValueError(f"it holds {dtype} text of characters that there are not")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
@@ -77,6 +79,7 @@ def read_npz(
     """
     try:
         with zipfile.ZipFile(file) as archive:
+            # numpy.savez appends .npy to names, to one that ends so too.
             held = {info.filename.removesuffix(".npy").removesuffix(".npy"): info for info in archive.infolist()}
             if (total := sum(info.file_size for info in held.values())) > most_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {most_bytes}")

@@ -19,7 +19,7 @@ from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_row
 
 HEADER_LIMIT = 1 << 16
 POINT_SIZE_LIMIT = 1 << 20
-"""Bytes, descriptors and padding included; the largest of PCL's own types has about 8 kB."""
+"""Bytes of a point, descriptors and padding included; the largest of PCL's own types has about 8 kB."""
 
 NUMPY_KINDS = {"F": "f", "I": "i", "U": "u"}
 SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -66,6 +66,7 @@ def _parse_header(head: bytes) -> _Header:
     encoding = last_line[1].decode("ascii", "replace")
     if encoding not in ENCODINGS:
         raise SceneError(f"PCD data is {encoding!r:.40}; expected one of {', '.join(ENCODINGS)}")
+    # The header is a line a keyword, in any order, up to DATA.
     entries: dict[str, list[str]] = {}
     for line in head[: last_line.start()].decode("utf-8", "replace").split("\n"):
         keyword, *values = line.split() or ["#"]
@@ -115,7 +116,8 @@ def _whole_numbers(entries: dict[str, list[str]], keyword: str, expected: int) -
 
 
 def _read_compressed(file: BinaryIO, header: _Header) -> NDArray[np.void]:
-    """Compressed data is column by column: all values of the first field, then all of the second."""
+    """Two sizes, packed and unpacked, then the packed data. Unpacked it is column by column: all values of the first
+    field, then all of the second."""
     sizes = read_binary_rows(file, np.dtype("<u4"), 2, "sizes of the compressed PCD data")
     compressed_size, size = sizes.tolist()
     compressed = read_binary_rows(file, np.dtype("u1"), compressed_size, "compressed PCD data").tobytes()
@@ -137,10 +139,10 @@ def _read_compressed(file: BinaryIO, header: _Header) -> NDArray[np.void]:
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytearray:
-    """LZF: a control byte below 32 announces that many literal bytes plus one; else a copy of earlier output.
+    """LZF: a control byte below 32 announces that many literal bytes plus one; any other a copy of earlier output.
 
-    Of a copy, the upper three bits (7: and the next byte) hold the length less two, the lower five and one more byte
-    how far back it starts, less one. It may overlap its own output, which repeats a pattern.
+    Of a copy's control byte, the upper three bits hold its length less two (for 7, the next byte is added), the lower
+    five and one more byte how far back it starts, less one. A copy may overlap its own output, which repeats a pattern.
     """
     out = bytearray()
     at = 0
@@ -153,7 +155,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytearray:
                 at += control + 1
                 continue
             length = (control >> 5) + 2
-            if length == 9:
+            if length == 9:  # 7 + 2: longer than three bits say
                 length += data[at]
                 at += 1
             distance = ((control & 31) << 8 | data[at]) + 1
@@ -163,7 +165,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytearray:
                 raise SceneError("the compressed PCD data points before its beginning: the file is damaged")
             if distance >= length:
                 out += out[start : start + length]
-            else:
+            else:  # it runs into what it writes: the last bytes, again and again
                 out += (out[start:] * (length // distance + 1))[:length]
     except IndexError:
         raise SceneError("the compressed PCD data ends within a copy: the file is damaged") from None

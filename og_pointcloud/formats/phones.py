@@ -9,8 +9,8 @@ ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_w
                 fx fy cx cy) and ``lowres_wide.traj``: time, rotation vector, translation, world to camera, OpenCV's
                 axes. An image takes the pose whose time is nearest, if that is within 10 ms.
 
-Images and depth images are of different sizes and one lens. Worlds are in meters and kept, so clouds that the apps
-export (y up) fit. Images are as the sensor gave them, in landscape, however the phone was held.
+Image and depth image have different sizes and one lens. Worlds are in meters and stay as they are, so that clouds which
+the apps export (y up) fit. Images are as the sensor gave them, in landscape, however the phone was held.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 SAME_TIME_S = 0.01
+"""Seconds between an image and its pose, at most."""
 
 
 def _sensor(width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Sensor:
@@ -78,7 +79,7 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
         content = read_json_object(source)
         pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
-        sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)
+        sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)  # it counts pixel centers at whole numbers
         yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth))
 
 

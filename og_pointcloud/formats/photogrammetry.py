@@ -34,13 +34,16 @@ ImageSize = Callable[[str], tuple[int, int]]
 
 MAX_BYTES = 1 << 28
 HEAD_BYTES = 4096
+"""Bytes within which a file shows what it is."""
 MOST_SKEW_PX = 1.0
+"""Shift by the skew b2, at the upper and the lower border, that is neglected."""
 FULL_FRAME = 36.0
+"""Millimeters of the longer side of the 35 mm film that RealityScan's lengths are of."""
 COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
 
 
 def find_photogrammetry(capture: Path) -> Path | None:
-    """The export of one of these programs in the folder, told by its first bytes, or None."""
+    """The export of one of these programs in the folder, known by its first bytes, or None."""
     files = [*sorted(capture.glob("*.xml")), *sorted(capture.glob("*.csv"))]
     return next((file for file in files if file.is_file() and _reader(file) is not None), None)
 
@@ -74,7 +77,7 @@ def _reader(file: Path) -> Callable[[str, ImageSize], PosedFrames] | None:
 
 
 def _metashape(text: str, _: ImageSize) -> PosedFrames:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few entities in each other unpack to gigabytes
         raise SceneError("the XML defines entities; expected none, as Metashape writes it: export it again")
     try:
         root = ElementTree.fromstring(text)
@@ -96,7 +99,7 @@ def _metashape(text: str, _: ImageSize) -> PosedFrames:
 
 
 def _cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
-    """Also of groups; but for disabled ones."""
+    """The enabled cameras of a chunk, those in groups too."""
     return [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled") not in ("false", "0")]
 
 
@@ -136,9 +139,10 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: Doubles,
     scale, rotation, translation = world
     with np.errstate(all="ignore"):  # the camera refuses what comes of it
         pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
+    # A sensor may have an initial and an adjusted calibration: poses belong to the adjusted one.
     calibrations = sensor.findall("calibration")
-    stated = next((made for made in calibrations if made.get("class") == "adjusted"), None)
-    calibration = stated if stated is not None else next(iter(calibrations), None)
+    adjusted = next((made for made in calibrations if made.get("class") == "adjusted"), None)
+    calibration = adjusted if adjusted is not None else next(iter(calibrations), None)
     resolution = sensor.find("resolution")
     if resolution is None:
         raise SceneError("its sensor has no resolution: export the cameras again")
@@ -150,6 +154,7 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: Doubles,
         raise SceneError("its sensor has no calibration: export the cameras again")
     terms = {child.tag: _floats(child, 1)[0].item() for child in calibration if child.tag != "resolution"}
     focal = terms.pop("f", 0.0)
+    # u = width / 2 + cx + x f + x b1 + y b2, v = height / 2 + cy + y f (Metashape's manual, camera models).
     cx, cy, skew = width / 2 + terms.pop("cx", 0.0), height / 2 + terms.pop("cy", 0.0), terms.pop("b2", 0.0)
     if abs(skew) * height > 2 * MOST_SKEW_PX * max(focal, 1.0):
         raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimise the cameras without b2")
@@ -201,14 +206,14 @@ def _realityscan(text: str, image_size: ImageSize) -> PosedFrames:
 
 
 def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> Iterator[PosedImage]:
-    for number, line in zip(itertools.count(2), lines, strict=False):
+    for number, line in zip(itertools.count(2), lines, strict=False):  # line 1 has the names
         name = (line["#name"] or "").strip().replace("\\", "/").rsplit("/", 1)[-1]
         with naming(f"line {number}"):
             if not name:
                 raise SceneError("it names no image; expected #name first: export it again")
             values = _numbers(line)
             width, height = image_size(name)
-            scale = max(width, height) / FULL_FRAME
+            scale = max(width, height) / FULL_FRAME  # pixels a millimeter
             center = np.array([values["x"], values["y"], values["alt"]])
             pose = rigid(_looking_down(values["heading"], values["pitch"], values["roll"]), center) * OPENGL
             camera = Camera(
@@ -221,7 +226,7 @@ def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> It
 
 
 def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
-    """By column; those that an export may leave out are 0."""
+    """The numbers of a line by column; 0 for columns that an export may leave out."""
     values = {}
     for column in COLUMNS:
         text = line.get(column)
@@ -237,7 +242,8 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
 
 
 def _looking_down(heading: float, pitch: float, roll: float) -> Doubles:
-    """(3, 3) camera to world, OpenGL axes. Degrees; heading is clockwise from north."""
+    """(3, 3) camera to world, OpenGL axes, world x east, y north, z up. Degrees; heading is clockwise from north. At 0
+    OpenGL's axes are the world's: the camera looks along -z, down, with its y to the north."""
     (sy, sp, sr), (cy, cp, cr) = (wave(np.radians([-heading, pitch, roll])) for wave in (np.sin, np.cos))
     about_up = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     about_right = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])

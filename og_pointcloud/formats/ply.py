@@ -25,6 +25,7 @@ HEADER_LIMIT = 1 << 18
 
 MOST_PROPERTIES = 1024
 LONGEST_NAME = 80
+"""Bounds of what a header may declare, far beyond any writer's."""
 
 NUMPY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -176,7 +177,7 @@ def _rows(file: BinaryIO, element: _Element, byte_order: str) -> NDArray[np.void
 
 
 def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:
-    """The same rows, little endian and without padding, each field of a type that PLY has."""
+    """The same rows, little endian and without padding; SceneError for fields of a type that PLY lacks."""
     names = rows.dtype.names
     if not names or rows.ndim != 1:
         raise SceneError(f"element '{element}' is {rows.dtype} {rows.shape}; expected a 1-D structured array")

@@ -1,5 +1,5 @@
-"""What every pose file gives, whatever its format: one record per image, in world coordinates; and what their readers
-share: lenses without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
+"""What every pose file gives, whatever its format: one record per image, in world coordinates. And what the readers of
+pose files share: cameras without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from og_pointcloud.scene import Camera
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 LARGEST = 1e30
-"""Of a number in a pose file: anything beyond is damage, and its square still is a number."""
+"""Bound of numbers in a pose file: anything beyond is damage. Their squares are still finite."""
 OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
-"""Factors of the columns of a pose, camera to world, between OpenGL's axes (y up, z back) and OpenCV's."""
+"""Factors of the columns of a camera-to-world pose, between OpenGL's axes (y up, z back) and OpenCV's."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,9 @@ def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ND
 
 
 def inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) inverse of a rigid transform (3 or 4, 4); of absurd numbers something that the camera refuses."""
+    """(4, 4) inverse of a rigid transform (3 or 4, 4)."""
     rotation = transform[:3, :3].T
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # `Camera` refuses what absurd numbers become
         return rigid(rotation, -rotation @ transform[:3, 3])
 
 
@@ -166,6 +166,7 @@ def rotation_of_vector(radians: ArrayLike) -> NDArray[np.float64]:
     """(3, 3) rotation about a vector (3,) by its length; NaN where that is not finite."""
     half = np.asarray(radians, np.float64) / 2
     with np.errstate(over="ignore", invalid="ignore"):
+        # The quaternion cos(angle), sin(angle) half / angle; np.sinc(x), sin(pi x) / (pi x), is 1 at an angle of 0.
         angle = np.linalg.norm(half)
         return rotation_of_quaternion([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
@@ -173,7 +174,8 @@ def rotation_of_vector(radians: ArrayLike) -> NDArray[np.float64]:
 def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    products = np.array(  # 4 q q'
+    # 4 q q': row i is the quaternion times four times its part i. The row of the largest part divides safely.
+    products = np.array(
         [
             [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
             [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
@@ -181,7 +183,7 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
             [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
         ]
     )
-    quaternion = products[products.diagonal().argmax()]  # the row of the largest part divides safely
+    quaternion = products[products.diagonal().argmax()]
     return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
 
 
@@ -218,7 +220,7 @@ def the_only(folder: Path, pattern: str, what: str) -> Path | None:
 
 
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
-    """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
+    """What a JSON file of bounded size holds (in memory up to twenty times its bytes). SceneError where it is none."""
     text = read_text(file, most)
     try:
         return json.loads(text)

@@ -103,9 +103,10 @@ Change = Callable[[list[Camera], Repair], list[Camera]]
 
 @dataclass(frozen=True)
 class Kind:
-    """change: of all cameras, which start from world coordinates, in the order of the pose file. words: the values that
-    there are; else numbers: how many it takes, of which the last is positive or may be negative. doublings: so many,
-    and halvings, of a number are tried by the checks, as every word is. of_all: a camera's change hangs on others."""
+    """change: a function of all cameras, which start from world coordinates, in the order of the pose file. words: the
+    values that it can have; or numbers: how many it takes, the last of which must be positive unless may_be_negative.
+    doublings: the checks try a number doubled, and halved, up to so many times; of words they try each. of_all: the
+    change of one camera depends on the others."""
 
     change: Change
     words: tuple[str, ...] = ()
@@ -130,7 +131,8 @@ def read_repairs(capture: Path) -> tuple[Repair, ...]:
 
 
 def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> list[Camera]:
-    """cameras: from world coordinates, in the order of the pose file."""
+    """The cameras after these repairs, one after the other. cameras: from world coordinates, in the order of the pose
+    file."""
     repaired = list(cameras)
     for repair in repairs:
         repaired = KINDS[repair.name].change(repaired, repair)
@@ -138,7 +140,7 @@ def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> li
 
 
 def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
-    """What the pose file means. Depth images move and scale with their photographs."""
+    """The images as the pose file means them. Depth images move and scale with their photographs."""
     cameras = repaired_cameras([image.camera for image in images], repairs)
     depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
     without_lens = {"lens": None} if any(repair.name == "lens" for repair in repairs) else {}
@@ -150,7 +152,7 @@ def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> 
 
 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
-    """What the mask files mean; layers: in the order of the pose file."""
+    """The masks as their files mean them; layers: in the order of the pose file."""
     repaired = list(layers)
     for value in (repair.value for repair in repairs if repair.name == "masks"):
         if value in MASK_SHIFTS:
@@ -188,15 +190,17 @@ def _each_pose(change: Callable[[Doubles, Repair], Doubles]) -> Change:
 
 
 def _with_xyzw(pose: Doubles, repair: Repair) -> Doubles:
-    """Of a rotation that was made from x y z w as if it were w x y z. q and -q are one rotation."""
+    """The pose whose quaternion, stored as x y z w, was read as w x y z. It is known from the rotation up to its sign,
+    which does not matter: q and -q are one rotation."""
     return rigid(rotation_of_quaternion(np.roll(quaternion_of(pose[:3, :3]), 1)), pose[:3, 3])
 
 
 def _with_axes(pose: Doubles, repair: Repair) -> Doubles:
-    """x of the poses' world is the named axis of the cloud's, and so on; a mirrored world mirrors its cameras too."""
+    """x of the poses' world is the named axis of the cloud's, and so on."""
     turn = np.eye(4)
     for row, axis in enumerate(repair.value.split(",")):
         turn[row, :3] = np.where(np.array(list("xyz")) == axis[-1], -1.0 if axis[0] == "-" else 1.0, 0.0)
+    # In a mirrored world (determinant -1) a pose would mirror its image: the camera's x is mirrored back.
     return np.diag([np.linalg.det(turn), 1, 1, 1]).round() @ pose @ turn
 
 

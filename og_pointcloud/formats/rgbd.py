@@ -1,4 +1,4 @@
-"""Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, each as its exporter writes it.
+"""Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, each as its exporter or renderer writes it.
 
 ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, in the 25k-frame subset,
           ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimeters with intrinsics of its own. A pose
@@ -115,7 +115,7 @@ def _scannet_lens(folder: Path, sensor: str, image: Path) -> Sensor:
 
 
 def _seven_scenes(folder: Path) -> Iterator[RecordedFrame]:
-    """Sequence by sequence."""
+    """Frames sequence by sequence, in the order of their numbers."""
     images = [
         file
         for sequence in _sequences(folder)
@@ -144,7 +144,7 @@ def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[Sensor, S
         return both, both
     width, height = size
     color, depth = (focal * width / FOCAL_WIDTH for focal in (COLOR_FOCAL_PX, DEPTH_FOCAL_PX))
-    middle = width / 2 + 0.5, height / 2 + 0.5
+    middle = width / 2 + 0.5, height / 2 + 0.5  # (320, 240) in the data set, which counts centers at whole numbers
     return Sensor(size, color, color, *middle), Sensor(size, depth, depth, *middle)
 
 
@@ -183,4 +183,5 @@ LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Iterable[RecordedF
     (_is_replica, _replica),
     (is_kitti360, read_kitti360),
 )
-"""How a folder is told, and what reads it; the first that fits is taken. One of your own is a pair more."""
+"""Pairs of a function that says whether a folder has a layout, and one that reads it; the first that fits is taken. A
+layout of your own is a pair more."""

@@ -1,9 +1,9 @@
 """SPZ, Niantic's packed splats: in (versions 2 to 4) and out (version 3).
 
-A header, then a column behind the other: positions as 24-bit fixed point, opacity, color, log scale in a byte each,
-rotations as three bytes x y z (version 2) or the smallest three of four in 32 bits. Versions 2 and 3 are one gzip of
-both; version 4 packs each column by itself with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's (y up, z
-back), a PLY's and the scene's are as trained (y down, z forward): converters turn y and z around, and so is it here.
+A header, then one column after the other: positions as 24-bit fixed point, opacity, color and log scale in a byte each,
+rotations as three bytes x y z (version 2) or as the smallest three of four parts in 32 bits. Versions 2 and 3 are one
+gzip of all; version 4 packs each column by itself with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's (y
+up, z back), those of a PLY and of the scene are as trained (y down, z forward): y and z change sign, as in converters.
 
 Harmonics above the constant one are not read, as of PLY files, nor written.
 
@@ -36,18 +36,20 @@ HEADER = struct.Struct("<4sIIBBBB")
 HARMONICS = (0, 3, 8, 15, 24)
 """Coefficients a channel above the constant one, by degree."""
 COLOR_SCALE, LOG_SCALE_STEPS, LOG_SCALE_LEAST = 0.15, 16.0, -10.0
+"""A byte stands for f_dc as byte / 255 = 0.5 + 0.15 f_dc, for a log scale in steps of 1/16 from -10 on."""
 FIXED_POINT = 1 << 23
+"""The sign bit of 24."""
 MOST_FRACTION_BITS = 23
 MAGNITUDE = 511
 """The largest of the nine bits that a part of a rotation has beside its sign."""
 PLACES = np.array([20, 10, 0], np.uint32)
-"""Bits by which the three smaller parts are shifted, in order."""
+"""Bits by which the three smaller parts, ten bits each, are shifted, in their order."""
 TURNED = np.array([1.0, -1.0, -1.0])
 """Factors of x, y, z, of positions and of quaternions, from one convention of axes to the other."""
 MOST_RATIO, PLENTY = 20, 1 << 24
-"""How many times its bytes a file may unpack to, and the bytes that any may: quantised noise shrinks to a half."""
+"""A file may unpack to so many times its own bytes, or to so many bytes: quantized noise shrinks to a half."""
 COARSEST = 1e-4
-"""The step of positions, over the cloud's extent, up to which they may be rounded."""
+"""The largest step to which positions may be rounded, as a share of the cloud's extent."""
 
 
 def looks_like_spz(head: bytes) -> bool:
@@ -172,13 +174,14 @@ def _byte(values: NDArray[np.floating]) -> Bytes:
 
 
 def _fixed_point(parts: Bytes) -> NDArray[np.int32]:
-    """(...) whole numbers of three bytes (..., 3) each, the lowest first, with a sign."""
+    """(...) whole numbers with a sign, of three bytes (..., 3) each, the lowest first."""
+    # Flipping the sign bit and taking it off again extends the sign from 24 to 32 bits.
     low, middle, high = np.moveaxis(parts.astype(np.int32), -1, 0)
     return ((low | middle << 8 | high << 16) ^ FIXED_POINT) - FIXED_POINT
 
 
 def _as_fixed_point(xyz: Doubles) -> tuple[Bytes, int]:
-    """(n, 9) bytes, and how many of their bits are fractions: as many as the farthest coordinate leaves."""
+    """(n, 9) bytes, and how many of their bits are fractions: as many as the coordinate farthest from 0 leaves."""
     farthest = float(np.abs(xyz).max(initial=0.0))
     bits = MOST_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((FIXED_POINT - 1) / farthest)))
     extent = float(np.ptp(xyz, axis=0).max(initial=0.0))
@@ -198,8 +201,8 @@ def _three_bytes(rotation: Bytes) -> Doubles:
 
 
 def _smallest_three(words: NDArray[np.uint32]) -> Doubles:
-    """(n, 4) quaternions x y z w: two bits name the largest, which is positive; the others have nine bits and a sign
-    each, of +-1/sqrt(2), the last one lowest."""
+    """(n, 4) quaternions x y z w: two bits name the largest part, which is positive. The others, at most 1/sqrt(2),
+    have nine bits and a sign each; the last one is lowest."""
     fields = words[:, None] >> PLACES
     size = (fields & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
     return from_smallest_three(words >> 30, np.where(fields >> 9 & 1, -size, size))

@@ -1,11 +1,12 @@
 """Photographs without poses -> a COLMAP model with poses and points, through pycolmap (extra 'poses').
 
-SIFT features, matches of pairs, incremental mapping, as COLMAP does them; here are the choices: photographs of one size
-share a lens, every photograph is compared with every other, or, of more than `ALL_PAIRS`, with its neighbors and some
-of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is free. Seeds are fixed.
+COLMAP finds SIFT features, matches pairs and maps incrementally. The choices made here: photographs of one size share a
+lens; every photograph is compared with every other or, if there are more than `ALL_PAIRS`, with its neighbors and some
+of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is arbitrary. Seeds are
+fixed.
 
-Structure from motion fails on bare walls, mirrors, or photographs taken from one spot: it says so, and makes no
-capture of a few that happened to fit.
+Structure from motion fails on bare walls, mirrors, or photographs taken from one spot. Then there is an error, and no
+capture of the few photographs that happened to fit.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ from og_pointcloud.journal import Journal
 
 MODEL_FOLDER = "sparse"
 FEWEST = 3
-"""Photographs that a model is made of at least."""
+"""A model has at least so many photographs."""
 LEAST_SHARE = 0.5
-"""Of the photographs must have found their place: fewer are a fragment of the scene, or none."""
+"""Share of the photographs that must find their place: fewer are a fragment of the scene."""
 ALL_PAIRS = 120
-"""Photographs up to which all pairs are compared; of more, every k-th with every k-th, so that there are as many."""
+"""Up to so many photographs all pairs are compared; of more, only pairs among every k-th, at most so many of them."""
 NEIGHBOURS = 10
-"""Photographs before and behind that each is compared with in any case."""
+"""Each photograph is in any case compared with so many before and after it."""
 CHUNK = 64
-"""Pairs between two looks at the keyboard."""
+"""Pairs that COLMAP matches in one call: Ctrl-C and the progress bar wait for its end."""
 SEED = 0
 CURE = (
     "take more photographs from more places, each sharing two thirds with the next, of textured and still things in "
@@ -47,8 +48,9 @@ CURE = (
 
 @dataclass(frozen=True)
 class PosesFound:
-    """capture: where it is. registered, of: photographs with a pose, and all. points: triangulated. error_px: mean of
-    their reprojection. left_out: file names without a pose. seconds: features, matches, mapping, wall clock."""
+    """capture: its folder. registered, of: numbers of photographs with a pose, and of all. points: number of
+    triangulated ones. error_px: mean error of their reprojection. left_out: names of files without a pose. seconds: of
+    features, matches and mapping, wall clock."""
 
     capture: Path
     registered: int
@@ -143,6 +145,7 @@ class _Run:
         options = colmap.FeatureExtractionOptions(
             use_gpu=False, num_threads=self._threads, max_image_size=self._longest_side
         )
+        # Image by image, so that each can be given the camera of its size; -1 makes a new one.
         for number in self._journal.steps(range(len(self._names)), "features"):
             reader, size = colmap.ImageReaderOptions(), self._sizes[number]
             reader.existing_camera_id = camera_of_size.get(size, -1)
@@ -176,7 +179,7 @@ class _Run:
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
-    """Which photographs are compared, in order."""
+    """Numbers of the photographs that are compared with each other."""
     step = max(1, -(-count // ALL_PAIRS))
     return [
         (first, second)
@@ -206,6 +209,7 @@ def _put_back_names(model: Any, files: Sequence[Path]) -> set[str]:
 
 def _turn_upright(model: Any) -> None:
     """Turn the world so that z is where the photographs' upper borders point to, on average."""
+    # The second row of a rotation, world to camera, is the camera's y axis (down) in the world.
     poses = [model.images[number].cam_from_world().matrix() for number in model.reg_image_ids()]
     up = -np.mean([pose[1, :3] for pose in poses], axis=0)
     if np.linalg.norm(up) > np.finfo(np.float64).eps:
@@ -214,7 +218,7 @@ def _turn_upright(model: Any) -> None:
 
 
 def _to_z(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rotation that takes a unit vector to z."""
+    """(3, 3) rotation that takes a unit vector to z: its rows are an orthonormal, right-handed frame with up last."""
     side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(up, side), up])

@@ -19,7 +19,7 @@ from og_pointcloud.errors import SceneError
 
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
-"""What helps where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
+"""The cure where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 
 
@@ -39,7 +39,7 @@ def _as_cell(value: object) -> object:
 
 @contextmanager
 def naming(place: str | Path) -> Iterator[None]:
-    """Put a file's path, or a place in it, once, before errors raised inside; what the disk refuses is a SceneError."""
+    """Put a file's path, or a place in it, before errors raised inside, once; errors of the disk become SceneError."""
     try:
         yield
     except SceneError as error:
@@ -126,7 +126,7 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     values = stack_columns(rows, names)
     low, high = values.min(initial=0.0), values.max(initial=0.0)
     if types == {np.dtype(np.uint16)}:
-        values /= 257.0
+        values /= 257.0  # 65535 / 255
     elif not (low >= 0 and high <= 255):
         raise SceneError(
             f"colors {', '.join(names)} span {low:.6g}..{high:.6g}; expected 0..1 or 0..255: rescale or drop them"
