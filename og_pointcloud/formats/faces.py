@@ -131,7 +131,8 @@ def _numbers(camera: Camera) -> Numbers:
 
 @lru_cache(maxsize=64)
 def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
-    """By face, the box that is seen of it at depth 1. A single view is called "", and ends at the image's whole pixels."""
+    """By face, the box that is seen of it, at depth 1. A single view is called "" and spans whole pixels of the
+    image."""
     width, height, fx, fy, cx, cy = whole
     # A grid twice as wide as the undistorted image would be resolves a telephoto lens; a wide one may see more than
     # that, and is tried again up to the widest single view.

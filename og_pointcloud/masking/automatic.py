@@ -1,7 +1,8 @@
-"""Everything in an image by a model that answers points: a grid of prompts, and of its answers the good ones once.
+"""Masks of everything in an image, by a model that answers point prompts: it is asked at a grid of points, and of its
+answers the good ones are kept, each once.
 
-After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of
-masks with nearly the same box the best stays, small holes are filled and small islands removed.
+After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of masks
+with nearly the same box the best stays, small holes are filled and small islands removed.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ class PointPredictor(Protocol):
 class AutomaticMasks:
     """A proposer around a `PointPredictor`.
 
-    points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: below, a mask is dropped.
-    stability_offset: logits by which the border is moved. same_box: box IoU from which two masks are one.
-    speck_share: holes and islands of less of the image go.
+    points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: a mask below either is dropped.
+    stability_offset: logits by which the border is moved. same_box: two masks whose boxes' IoU is more are one.
+    speck_share: holes and islands of a smaller share of the image go. Defaults are segment-anything's, which removes no
+    specks.
     """
 
     predictor: PointPredictor
@@ -59,16 +61,17 @@ class AutomaticMasks:
         batches = (points[first : first + self.batch] for first in range(0, len(points), self.batch))
         kept = [self._good(*self.predictor.at_points(batch)) for batch in batches]
         logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
+        # Duplicates go while masks are small: most prompts find a thing that others found too.
         best = best_of_alike(logits > 0, scores, self.same_box)
         masks = np.zeros((len(best), height, width), np.bool_)
         for mask, chosen in zip(masks, best, strict=True):
             full = require_cv2().resize(logits[chosen], (width, height), interpolation=require_cv2().INTER_LINEAR)
             mask[:] = without_specks(full > 0, round(self.speck_share * width * height))
-        kept_whole = best_of_alike(masks, scores[best], self.same_box)  # again: specks made boxes larger
+        kept_whole = best_of_alike(masks, scores[best], self.same_box)  # again: specks had made boxes larger
         return Proposals(masks[kept_whole], scores[best][kept_whole])
 
     def _good(self, logits: Floats, iou: Floats) -> tuple[Floats, Floats]:
-        """Of the answers (k, m, h, w) and (k, m) to a batch of prompts the stable ones: (n, h, w), and scores (n,)."""
+        """Those of the answers (k, m, h, w) and (k, m) to a batch that are good: (n, h, w), and their scores (n,)."""
         logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
         good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
         good[good] = stability(logits[good], self.stability_offset) >= self.least_stability
@@ -89,8 +92,8 @@ def stability(logits: Floats, offset: float) -> Floats:
 
 
 def best_of_alike(masks: Masks, scores: Floats, same: float) -> NDArray[np.intp]:
-    """Non-maximum suppression: indices, best score first, of masks (n, h, w) with a score above 0 whose boxes' IoU with
-    no better one is above ``same``."""
+    """Non-maximum suppression of masks (n, h, w) by their boxes: indices, best score first, of those with a score above
+    0 whose box has an IoU above ``same`` with that of no better one."""
     cv2 = require_cv2()
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks]
     return np.array(cv2.dnn.NMSBoxes(boxes, scores.tolist(), 0.0, same), np.intp).reshape(-1)
@@ -106,7 +109,7 @@ def _specks(mask: Masks, smallest_px: int, spare_largest: bool) -> Masks:
     _, labels, stats, _ = require_cv2().connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     area = stats[:, require_cv2().CC_STAT_AREA]
     small = area < smallest_px
-    small[0] = False
+    small[0] = False  # label 0 is what is outside of the mask
     if spare_largest and len(area) > 1:
         small[1 + int(np.argmax(area[1:]))] = False
     return small[labels]

@@ -30,9 +30,10 @@ def load_model(folder: str | os.PathLike[str], attention: Attention = "sdpa") ->
 class ImageTower(torch.nn.Module):
     """Pixels (B, 3, h * patch, w * patch) float32 -> unit vectors of images (B, D) and of their patches (B, h, w, D).
 
-    A model makes one vector of an image where tokens attend to each other last: CLIP in its last layer, to the class
-    token; SigLIP in its head, to a probe. There each patch attends to itself alone, so that its own value comes out, in
-    the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai, ECCV 2022), section 3.2.
+    A model gathers an image into one vector where its tokens attend to each other for the last time: CLIP in its last
+    layer, by the class token; SigLIP in its head, by a probe. For the vectors of patches, each patch attends there to
+    itself alone, so that its own value comes out, in the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai,
+    ECCV 2022), section 3.2.
     """
 
     def __init__(self, model: Any) -> None:
@@ -46,16 +47,18 @@ class ImageTower(torch.nn.Module):
         seen = vision(pixel_values=pixels, interpolate_pos_encoding=True, output_hidden_states=True)
         if self.model.config.model_type == "clip":
             image = self.model.visual_projection(seen.pooler_output)
+            # The last layer once more, on what goes into it, without the class token: a softmax over one token is 1, so
+            # that attention is the token's own value.
             last, tokens = vision.encoder.layers[-1], seen.hidden_states[-2][:, 1:]
             attention = last.self_attn
             tokens = tokens + attention.out_proj(attention.v_proj(last.layer_norm1(tokens)))
             tokens = tokens + last.mlp(last.layer_norm2(tokens))
-            found = self.model.visual_projection(vision.post_layernorm(tokens))
+            patches = self.model.visual_projection(vision.post_layernorm(tokens))
         else:
             image, tokens = seen.pooler_output, seen.last_hidden_state
-            found = vision.head(tokens.flatten(0, 1)[:, None])  # each patch an image of one
+            patches = vision.head(tokens.flatten(0, 1)[:, None])  # each patch as an image of one
         rows, columns = (side // self.patch for side in pixels.shape[2:])
-        return _unit(image), _unit(found).reshape(-1, rows, columns, image.shape[1])
+        return _unit(image), _unit(patches).reshape(-1, rows, columns, image.shape[1])
 
 
 def _unit(vectors: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What the front end agrees on: proposers and encoders as protocols, and the settings."""
+"""What proposers, encoders and the code that runs them agree on: protocols, and the settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from og_pointcloud.masking.crops import Crop, Preprocessing
 FEATURES = ("crops", "dense")
 """How the encoder is shown a mask."""
 LEVELS = ("small", "medium", "large")
-"""How much is one mask, as SAM and LangSplat call it."""
+"""How much one mask covers, as LangSplat calls it: SAM's subparts, parts and wholes."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Proposals:
     """Masks of one image; they may overlap, and contain one another.
 
     masks: (M, H, W) bool. scores: (M,) float32 in [0, 1], how much the proposer trusts each; what no model scored is 1.
-    tracks: (M,) int64, of a tracker, equal numbers for what it takes for one thing through all images, -1 unknown.
+    tracks: (M,) int64, from a tracker: one number for what it takes for one thing in all images, -1 unknown.
     """
 
     masks: NDArray[np.bool_]
@@ -75,8 +75,8 @@ class MaskEncoder(Protocol):
 class ImageModel(Protocol):
     """Squares of pixels -> vectors.
 
-    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
-    patches that it has vectors of, too, pixels; None without.
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side, in
+    pixels, of the patches that it also gives vectors of; None where it gives none.
     """
 
     feature_space: str
@@ -96,16 +96,16 @@ class ImageModel(Protocol):
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """How masks are made; what changes one of these starts anew.
+    """How masks are made. A run with other settings takes up nothing of an earlier one.
 
     proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with zero features.
     level: small, medium or large (`levels.PREFERENCE`).
     features: crops, a few runs of the encoder a mask; or dense, one an image, coarser (`masking/dense.py`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
-    every: of so many images one is used.
+    every: every so many-th image is used.
     words: what to look for, with a proposer that takes words (`sam3`).
-    tracks: things are followed from image to image, in the order of the pose file; of a folder of id PNGs: its ids are
-        the same thing's in all images, as video trackers write them.
+    tracks: things are followed from image to image, in the order of the pose file. With a folder of id PNGs: an id
+        means the same thing in all images, as video trackers write them.
     """
 
     proposer: str = "opencv"
@@ -129,6 +129,7 @@ class MaskSettings:
 
     @property
     def threads(self) -> int:
-        """Images worked on side by side: one a core, but one alone with models that fill memory and cores."""
+        """Images worked on side by side: one a core, but only one with models, which fill memory and cores
+        themselves."""
         light = (self.proposer == "opencv" or Path(self.proposer).is_dir()) and self.encoder in (None, "demo")
         return (os.cpu_count() or 1) if light else 1

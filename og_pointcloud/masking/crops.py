@@ -1,8 +1,8 @@
-"""Square cut-outs of an image, one a mask, and the numbers that an image encoder takes for their pixels.
+"""Square cut-outs of an image, one a mask, and their pixels as the numbers that an image encoder takes.
 
-LangSplat's: the mask's tight box with black outside the mask, padded to a square. Better ones show where the thing
-stands: a larger window, and outside the mask a blend of the image with an even color, so that the encoder sees a
-table's chairs, and still which of them is meant. Several are weighted into one vector by the encoder.
+LangSplat's cut-out is the mask's tight box with black outside the mask, padded to a square. Better ones show where the
+thing stands: a larger window, and outside the mask a blend of the image with an even color, so that the encoder sees
+the chairs around a table, and still which of them is meant. The encoder weights several of them into one vector.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ MAX_SIZE = 4096
 class Crop:
     """One way to cut a mask out.
 
-    scale: side of the window, over the longer side of the mask's box. outside: how much of the image is left outside
-    the mask, 0 none, 1 all of it. weight: of this crop's vector in the mask's.
+    scale: side of the window as a multiple of the longer side of the mask's box. outside: how much the image shows
+    outside the mask, from 0, not at all, to 1, fully. weight: of this crop's vector in the mask's.
     """
 
     scale: float = 1.0
@@ -47,7 +47,7 @@ CROP_STYLES = {"langsplat": LANGSPLAT, "context": WITH_CONTEXT}
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """From squares of an image to what an image model takes.
+    """How squares of an image become what an image model takes.
 
     size: of the square, pixels. mean, std: RGB, of values in [0, 1]. keeps_shape: whether the model's own processor
     cuts an image to a square rather than squeezing it; crops of masks are squares already.
@@ -76,12 +76,13 @@ class Preprocessing:
 
     @property
     def fill(self) -> tuple[int, int, int]:
-        """The color that becomes zero, or nearly: what says nothing to the model."""
+        """The color that becomes zero, or nearly, and so says nothing to the model."""
         red, green, blue = (round(255 * value) for value in self.mean)
         return red, green, blue
 
     def pixels(self, squares: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(B, 3, size, size) float32 of squares (B, size, size, 3) uint8 RGB."""
+        # (value / 255 - mean) / std as one product and one difference.
         scale, offset = 1 / (255 * np.array(self.std)), np.array(self.mean) / np.array(self.std)
         values = squares * scale.astype(np.float32) - offset.astype(np.float32)
         return np.ascontiguousarray(values.transpose(0, 3, 1, 2), np.float32)
@@ -102,9 +103,8 @@ def mask_crops(
     """
     require_masks(image, masks)
     pillow = require_pillow()
-    faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(
-        np.uint8
-    )  # once, not for every mask
+    # The whole image as it is shown outside of masks: made once, not for every mask.
+    faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(np.uint8)
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):
         square = _square(image, faded, mask, crop.scale, fill)
@@ -136,10 +136,11 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
 def _square(
     image: NDArray[np.uint8], faded: NDArray[np.uint8], mask: NDArray[np.bool_], scale: float, fill: Sequence[int]
 ) -> NDArray[np.uint8]:
-    """A square around the mask's box, faded outside the mask, of the fill beyond the image's edge."""
+    """A square around the middle of the mask's box, faded outside the mask; beyond the image's edge it is the fill."""
     top, left, height, width = mask_box(mask)
     side = max(round(scale * max(height, width)), 1)
     top, left = top - (side - height) // 2, left - (side - width) // 2
+    # The part of the square that lies in the image.
     rows = slice(max(top, 0), min(top + side, image.shape[0]))
     columns = slice(max(left, 0), min(left + side, image.shape[1]))
     shown, inside = faded[rows, columns].copy(), mask[rows, columns]

@@ -1,8 +1,9 @@
-"""A mask's vector from one run of the encoder on the whole image: the mean of its patches. Faster, coarser than crops.
+"""A mask's vector from one run of the encoder on the whole image: the mean of its patches. Faster than crops, coarser.
 
-Crops show the encoder each mask by itself, several runs a mask. Here it sees the image once, and a mask's vector is the
-mean of the vectors of its patches, each weighted by how much of it the mask covers. What a patch is, rather than what
-the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): see `clip.ImageTower`.
+Crops show the encoder each mask by itself, in several runs a mask. Here it sees the image once, and a mask's vector is
+the mean of the vectors of its patches, each weighted by how much of it the mask covers. Vectors of patches, that tell
+what a patch shows and not what the image is about, are made as in MaskCLIP (Zhou, Loy and Dai, ECCV 2022): see
+`clip.ImageTower`.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import require_masks
 
 SHORTER_SIDE = 2.0
-"""The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
-side, and positions in between are interpolated."""
+"""The image's shorter side, in sides of the square that the model was trained on. With CLIP B/16 it then spans 28
+patches instead of 14; their position embeddings are interpolated."""
 
 
 class DenseEncoder(MaskEncoder):
@@ -45,7 +46,7 @@ class DenseEncoder(MaskEncoder):
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def _pixels(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(1, 3, h, w) of whole patches, the image's shape but for rounding."""
+        """(1, 3, h, w) float32, a whole number of patches along each side; the image's shape but for rounding."""
         before, pillow = self.model.preprocessing, require_pillow()
         scale = SHORTER_SIDE * before.size / min(image.shape[:2])
         height, width = (max(1, round(side * scale / self.patch)) * self.patch for side in image.shape[:2])
@@ -54,7 +55,8 @@ class DenseEncoder(MaskEncoder):
 
 
 def _shares(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.float32]:
-    """(height, width): how much of each patch the mask covers; of an image smaller than that, of its nearest pixel."""
+    """(height, width) float32: how much of each patch the mask covers. In an image with fewer pixels than patches, the
+    mask is interpolated."""
     cv2 = require_cv2()
     shrinks = mask.shape[0] >= height and mask.shape[1] >= width
     shrunk = cv2.resize(

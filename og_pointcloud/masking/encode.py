@@ -1,4 +1,4 @@
-"""Mask encoders: what a mask shows, as a vector of the space that a text encoder of the same name puts words into.
+"""Mask encoders: what a mask shows, as a vector in the space into which a text encoder of the same name puts words.
 
 ``open_encoder`` opens three kinds:
 
@@ -10,7 +10,8 @@
                         pixels (B, 3, h * patch, w * patch), and -> patches (B, h, w, D) float32, unit vectors, too
 - "demo", such a folder that comes with the library; it knows the things of the procedural room and nothing else.
 
-A folder is checked before it is run, since it may come from a stranger: nothing is unpickled, no code of it is run.
+A folder may come from a stranger, so it is checked before its graph is run: nothing is unpickled, no code of its own
+runs.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ OPERATORS = frozenset({
     "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Resize", "Shape", "Sigmoid",
     "Slice", "Softmax", "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
-"""All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
+"""The operators that an encoder's graph may have: arithmetic, without loops, random numbers or graphs inside nodes."""
 ENCODER = EncoderFormat("og-image-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
 """Bounds memory: a run of a large model holds some 100 MB a crop."""
@@ -118,7 +119,7 @@ class CropEncoder(MaskEncoder):
 
     def _vectors(self, image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDArray[np.float32]:
         before = self.model.preprocessing
-        # Black outside, as LangSplat has it, is a color to the model; what a blend goes to should be none.
+        # LangSplat's black outside is a color to the model, and part of its way to cut. A blend should fade to nothing.
         fill = before.fill if crop.outside else (0, 0, 0)
         return self.model(before.pixels(mask_crops(image, masks, crop, before.size, fill, before.resample)))
 

@@ -20,7 +20,7 @@ from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
 MAX_MASKS_PX = 1 << 33
-"""Masks of one image together: more is refused before anything is allocated."""
+"""Pixels of all masks of one image together: more is refused before memory is taken for them."""
 
 
 def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> Proposals:
@@ -34,10 +34,10 @@ def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> P
 
 
 def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
-    """What a function of the user's gave, as proposals for an image of ``shape`` (H, W).
+    """What a function of the user's returned, as proposals for an image of ``shape`` (H, W).
 
-    Taken: Proposals; bool (M, H, W), all of score 1; an id map of integers (H, W), negative outside every mask, and 0
-    as well where nothing is negative.
+    It may return Proposals; bool (M, H, W), which get the score 1; or an id map of integers (H, W), negative outside
+    every mask, or, if nothing is negative, 0 outside.
     """
     masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
     if masks.shape[-2:] != shape:
@@ -68,8 +68,8 @@ class CallableProposer:
 
 
 def own_proposer(place: str) -> MaskProposer:
-    """What ``MODULE:NAME`` holds: a function as `CallableProposer` takes it, a proposer, or a class of proposers, which
-    is called without arguments. SceneError where it is not there.
+    """The proposer ``MODULE:NAME``: a function as `CallableProposer` takes it, a proposer, or a class of proposers,
+    which is called without arguments. SceneError where it is not there.
 
     MODULE is the file ``MODULE.py`` in the working directory (dots are folders), else a module that Python finds. The
     import path stays as it is: a file that imports its neighbors needs their folder in PYTHONPATH.
@@ -79,7 +79,7 @@ def own_proposer(place: str) -> MaskProposer:
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
         file = Path(*module.split(".")).with_suffix(".py")
-        # By path where it lies here: a file called numpy.py takes nobody's place.
+        # A file is run by its path, not imported: one called numpy.py does not take numpy's place.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, KeyError) as error:
         raise SceneError(
@@ -131,6 +131,7 @@ class ExistingMasks:
             content = read_json(file, MAX_JSON_BYTES)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
+            # COCO lists images and annotations apart; polygons need the size of their image.
             stems: dict[Any, tuple[str, list[Any]]] = {}
             for image in content["images"]:
                 if not isinstance(image, dict) or not isinstance(image.get("file_name"), str):
@@ -165,7 +166,7 @@ def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
             f"{height * width}; expected runs that fill it: it is damaged or of another image"
         )
     values = np.arange(len(counts)) % 2 == 1
-    return np.repeat(values, counts).reshape(width, height).T
+    return np.repeat(values, counts).reshape(width, height).T  # runs go down the columns
 
 
 def _size(size: Any, source: str) -> tuple[int, int]:
@@ -178,8 +179,9 @@ def _size(size: Any, source: str) -> tuple[int, int]:
 
 
 def _decompressed(text: str | bytes, source: str) -> list[int]:
-    """COCO's text: 5 bits a character from 48 on, the sixth says that more follow, the last one's fifth is the sign;
-    from the fourth run on, differences to the run before the last."""
+    """Run lengths from COCO's text (cocoapi, maskApi.c, rleToString). A character, less 48, has six bits: five of the
+    number, the lowest first, and a sixth that says that more follow; the fifth bit of the last one is the sign. From
+    the fourth run on, numbers are differences to the run two before."""
     data = text.encode("latin-1", "replace") if isinstance(text, str) else text
     runs: list[int] = []
     value = shift = 0
@@ -190,7 +192,7 @@ def _decompressed(text: str | bytes, source: str) -> list[int]:
         value |= (bits & 31) << shift
         shift += 5
         if not bits & 32:
-            if bits & 16:
+            if bits & 16:  # two's complement of so many bits
                 value -= 1 << shift
             runs.append(value + runs[-2] if len(runs) > 2 else value)
             value = shift = 0
@@ -207,7 +209,7 @@ def _annotations(found: Any) -> list[dict[str, Any]]:
 
 
 def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Proposals | None:
-    """None where there are none: nothing says how large they would be."""
+    """The masks of annotations of one image; None where there are none, as nothing says how large they would be."""
     masks, scores = [], []
     for index, annotation in enumerate(annotations):
         where = f"{source}, annotation {index}"
@@ -225,7 +227,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Pro
 
 
 def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
-    """Rings of x, y in pixels. size: [height, width]."""
+    """The mask inside of rings of x, y in pixels. size: [height, width]."""
     drawn = np.zeros(_size(size, source), np.uint8)
     for ring in polygons:
         try:

@@ -1,10 +1,10 @@
 """Overlapping proposals -> one id map, on a level: small, medium or large.
 
-Proposals that nearly coincide become one, the better scored. What lies inside another is its child: a forest. A level
-is a cut through the forest: a mask is used instead of its parts where its area times its score is more than what the
-best choice among its parts adds up to, times what the level asks for (`PREFERENCE`). A level that asks for less cuts
-higher or equally high everywhere, so a small mask lies in a medium one and that in a large one. Where the masks of one
-level still overlap, the better score has the pixels.
+Of proposals that nearly coincide, the best scored stays. A mask that lies inside another is its child: so they form a
+forest. A level is a cut through the forest: a mask is used instead of its parts if its value, area times score, is at
+least the value of the best choice among its parts, times what the level asks for (`PREFERENCE`). A level that asks for
+less cuts higher or equally high everywhere, so a small mask lies in a medium one and that in a large one. Where masks
+of one level still overlap, the better scored has the pixels.
 
 Everything is counted on atoms, the sets of pixels with the same masks over them: exact, and independent of the image's
 size after one pass.
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from og_pointcloud.masking.contracts import Proposals
 
 PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
-"""Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
+"""Level -> weight of the value of a mask's parts beside its own: more prefers parts, less prefers wholes."""
 SAME = 0.8
 """Two masks whose intersection over union is more are one."""
 INSIDE = 0.9
-"""A mask of which more than this part lies in a larger one is its child."""
+"""A mask of which more than this share lies in a larger one is its child."""
 VISIBLE = 0.3
-"""A mask of which better ones leave less than this part is left out."""
+"""A mask of which better ones leave less than this share is left out."""
 
 
 def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
@@ -33,19 +33,22 @@ def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArra
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
+    # (M, M) pixels that each two masks share; on the diagonal the area of each.
     shared_px = (member * area_px) @ member.T.astype(np.float64)
     kept = _distinct(shared_px)
     member, scores, shared_px = member[kept], scores[kept], shared_px[np.ix_(kept, kept)]
     used = _cut(np.diag(shared_px), scores, _parents(shared_px), PREFERENCE[level])
+    # Ids 0..K-1 of the masks that own an atom, best first, as masks are in that order.
     shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
     ids = ids - (shown[:1] < 0).sum()  # -1, where there is one, is the first of the owners
     return ids.astype(np.int32)[atom_of_pixel], order[kept][shown[shown >= 0]]
 
 
 def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:
-    """(H, W) the atom of each pixel; (M, atoms) which masks cover it; (atoms,) its pixels."""
+    """(H, W) the atom of each pixel; (M, atoms) which masks cover each atom; (atoms,) its pixels."""
+    # Each mask is a random number, a set of masks their sum: two sets have one sum once in 2^63 draws or so.
     rng = np.random.default_rng(0)
-    signature = np.zeros(masks.shape[1:], np.uint64)  # two sets of masks collide once in 2^64 draws
+    signature = np.zeros(masks.shape[1:], np.uint64)
     for mask in masks:
         signature[mask] += rng.integers(1 << 63, dtype=np.uint64)
     _, first, atom_of_pixel, area_px = np.unique(signature, return_index=True, return_inverse=True, return_counts=True)
@@ -54,7 +57,7 @@ def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_
 
 
 def _distinct(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Masks, best first, without empty ones and those that nearly coincide with one before them."""
+    """Rows of the masks, which are best first, without empty ones and those that nearly coincide with one before."""
     area_px = np.diag(shared_px)
     kept: list[int] = []
     for mask in np.flatnonzero(area_px > 0).tolist():
@@ -80,6 +83,7 @@ def _cut(
 ) -> NDArray[np.intp]:
     """The masks of one level, best first: none lies inside another in the forest. A whole that ties with its parts is
     used."""
+    # parts: best value that a mask's children can make together. Children come first, as they are smaller.
     value, parts = area_px * scores, np.zeros(len(parent))
     used = np.zeros(len(parent), bool)
     upwards = np.argsort(area_px, kind="stable")  # a parent is larger
@@ -87,6 +91,7 @@ def _cut(
         used[mask] = value[mask] >= preference * parts[mask]
         if parent[mask] >= 0:
             parts[parent[mask]] += max(value[mask], preference * parts[mask])
+    # From the roots down: nothing inside of a mask that is used is used, too.
     covered = np.zeros(len(parent) + 1, bool)  # the last entry serves roots, whose parent is -1
     for mask in upwards[::-1]:
         used[mask] &= not covered[parent[mask]]
@@ -97,7 +102,7 @@ def _cut(
 def _owners(member: NDArray[np.bool_], area_px: NDArray[np.float64], used: NDArray[np.intp]) -> NDArray[np.intp]:
     """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
     owner = np.full(member.shape[1], -1)
-    for mask in used[::-1]:
+    for mask in used[::-1]:  # the best last, so that it has what it shares
         owner[member[mask]] = mask
     shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
     hidden = shown_px < VISIBLE * (member @ area_px)

@@ -1,8 +1,9 @@
 """Photographs -> masks and mask features in a capture folder: resumable, nothing half-written.
 
-What each image gives is first an atomic file of its own in ``masks.work/``; when all are there they become ``masks/``
-with ``mask_features.npz``, and the folder goes. Killed at any moment, the same command goes on behind the last image;
-where all is made already it does nothing. ``made.json`` beside the masks says that they were made here, and how.
+The masks of each image are first a file of its own in ``masks.work/``, written whole or not at all. When all are there
+they become ``masks/`` with ``mask_features.npz``, and ``masks.work/`` goes. Killed at any moment, the same command goes
+on after the last image that was done; where everything is made already it does nothing. ``made.json`` beside the masks
+says that they were made here, and how.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ PREVIEW_IMAGES = 4
 
 @dataclass(frozen=True)
 class MasksMade:
-    """images, done_before: how many were made, and of these how many an interrupted run had made. masks: of all images.
-    left_out: names of images that were not needed. seconds: wall clock."""
+    """images: how many were used; done_before: how many of these an interrupted run had done. masks: how many there are
+    in all images. left_out: names of images that were not used. seconds: wall clock."""
 
     output: Path
     images: int
@@ -66,9 +67,9 @@ def make_masks(
 
     output: where they go; None: into the capture. Another folder becomes a capture of its own: poses of the images that
     are used, and links to everything else. It is needed where images are left out.
-    overwrite: replace masks that were not made here, and make again what is complete. progress: show a bar with the
+    overwrite: replace masks that were not made here, and make complete ones again. progress: show a bar with the
     remaining time where stderr is a terminal; masks_preview.png shows the first images as soon as they are done.
-    Warns of each image that is broken, and raises SceneError when the others are done and kept; OgPointcloudError where
+    Warns of each image that is broken, and raises SceneError once the others are done and kept; OgPointcloudError where
     masks that were not made here would be overwritten.
     """
     settings, start = settings or MaskSettings(), time.perf_counter()
@@ -76,10 +77,12 @@ def make_masks(
     target = capture if output is None else Path(output)
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
+    # Every so many-th image, with all faces of each.
     used = set(list(dict.fromkeys(photograph.path for photograph in photographs))[:: settings.every])
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate)
     _refuse_foreign(target, overwrite)
+    # Names of work files hold all that decides what is in them, so that what exists can be used as it is.
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
@@ -94,7 +97,7 @@ def make_masks(
             _write_made(target, settings, tasks, **made)
             shutil.rmtree(target / WORK_FOLDER)
     if separate:
-        _make_capture_of(capture, target, chosen)  # poses may be new
+        _make_capture_of(capture, target, chosen)  # also where masks were complete: poses may have changed
     space = str(made.get("feature_space", UNKNOWN_SPACE))
     return MasksMade(target, len(tasks), done_before, made["masks"], left_out, space, time.perf_counter() - start)
 
@@ -103,7 +106,8 @@ def make_masks(
 
 
 def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], separate: bool) -> tuple[str, ...]:
-    """Names of the images that are not used, which needs a folder of its own."""
+    """Names of the images that are not used; OgPointcloudError if there are some and the output is no folder of its
+    own."""
     used = {photograph.name for photograph in chosen}
     names = tuple(photograph.name for photograph in photographs if photograph.name not in used)
     if names and not separate:
@@ -115,8 +119,8 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """Work files of other settings are not taken up. Which images are used does not matter to an image."""
-    of_image = replace(settings, every=1)
+    """A name for settings, and for the masks of a folder that they name: work files of others are not taken up."""
+    of_image = replace(settings, every=1)  # which images are used does not change what one of them gives
     given = Path(settings.proposer)
     masks = [_state(file) for file in sorted(given.rglob("*"))] if given.is_dir() else []
     return _digest([VERSION, asdict(of_image), masks])
@@ -127,7 +131,7 @@ def _work_name(photograph: Photograph) -> str:
 
 
 def _state(file: Path) -> tuple[str, int, int]:
-    """What changes when a file does."""
+    """Name, size and time of a file: what changes when the file does."""
     state = file.stat()
     return file.name, state.st_size, state.st_mtime_ns
 
@@ -163,10 +167,10 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
 
 
 def _refuse_foreign(target: Path, overwrite: bool) -> None:
-    """OgPointcloudError where masks or features of somebody else would be replaced, or lie elsewhere."""
+    """OgPointcloudError where masks or features that were not made here would be replaced, or folders are links."""
     folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
     for link in (folder, target / WORK_FOLDER):
-        if link.is_symlink():  # as a stranger's capture may have it
+        if link.is_symlink():  # a stranger's capture could have masks written anywhere by it
             raise OgPointcloudError(
                 f"{link} is a link to '{link.readlink()}'; expected a folder of the capture's own, as nothing is "
                 "written through links: remove it, or give another folder (-o DIR)"
@@ -194,10 +198,11 @@ def _made_before(target: Path, tasks: Sequence[ImageTask], key: str) -> dict[str
 
 
 def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> tuple[int, str]:
-    """Work files -> the capture's files. Number of masks, and the feature space."""
+    """Write the capture's files from the work files. Number of masks, and the feature space."""
     folder = target / MASKS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    _write_made(target, settings, tasks)  # first: killed here, the next run knows the folder as ours, but not as whole
+    # First, and without a key: after a kill in here the next run knows the folder as ours, but not as complete.
+    _write_made(target, settings, tasks)
     features: dict[str, Any] = {}
     space, masks = UNKNOWN_SPACE, 0
     for task in tasks:
@@ -214,14 +219,14 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
 
 
 def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:
-    """record: what a run leaves that came to its end."""
+    """Write made.json. record: what a run adds at its end."""
     named = {key: _last_part(value) for key, value in asdict(settings).items()}
     made = {"made_by": "og-pointcloud masks", **named, "images": len(tasks), **record}
     _write_json(target / MASKS_FOLDER / MADE_NAME, made)
 
 
 def _last_part(value: Any) -> Any:
-    """Of a folder its name alone: captures are passed on, where models lie on this machine is nobody's business."""
+    """A path reduced to its last part: captures are passed on, and where models lie on this machine is private."""
     kind, colon, name = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     return f"{kind}{colon}{Path(name).name}" if Path(name).is_absolute() else value
 

@@ -1,12 +1,13 @@
 """Masks without a model: superpixels merged by color and contrast into a region tree.
 
-1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
-   from one surface into another of its color.
-2. Merging: in every round, pairs of neighbors that are each other's nearest become one region. How far apart two
-   are follows from their mean colors and the contrast along their common border. Small regions are near to all their
-   neighbors, and texture brings regions nearer.
-3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
-   was made is its score. They overlap only by containing one another; `levels` settles which to use.
+1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that no
+superpixel
+   runs from one surface into another of its color.
+2. Merging: in every round, pairs of neighbors that are each other's nearest become one region. The distance of two
+   regions follows from their mean colors and the contrast along their common border; small regions are nearer to all
+   their neighbors, and so are textured ones.
+3. Proposals: the regions that lasted. A region's score compares the distance at which it was merged away with that at
+   which it was made. Regions overlap only by containing one another; `levels` settles which to use.
 
 All lengths are shares of the image's; distances are in 8-bit CIE Lab. Nothing is tuned to a scene.
 """
@@ -31,30 +32,30 @@ WORKING_SIDE = 480
 FEWEST_PIXELS = 8
 """An image whose shorter side is less shows nothing."""
 GRAPH_SIGMA, GRAPH_K = 0.6, 15.0
-"""Blur of the graph segmentation in pixels, and how large superpixels are; fine, since merging comes after."""
+"""The graph segmentation's blur in pixels, and its k, which makes superpixels large; small here, as merging follows."""
 SMALLEST_SUPERPIXEL = 1e-4
 """Share of the image."""
 CELL_SHARE = 1 / 40
-"""Side of a SLIC cell, of the image's longer side."""
+"""Side of a SLIC cell, as a share of the image's longer side."""
 LIGHTNESS = 0.5
 """Weight of lightness beside the two color channels: shading and shadows change lightness first."""
 TEXTURE = 0.03
-"""Per unit of the standard deviation inside both regions, distances count so much less."""
+"""Color distances are divided by 1 + this times the standard deviation inside the less textured of the two regions."""
 REACH_PX = 2
-"""Borders are compared so many pixels to either side: the border itself is blurred."""
+"""Contrast is taken so many pixels to either side of a border: the border itself is blurred."""
 SMALL_REGION = 4e-3
 """Share of the image: a region of this size is nearer to its neighbors by the root of 2 than a large one."""
 NOISE = 5.0
-"""Distances below this say nothing: it is added to both sides of the score's ratio."""
+"""Smaller distances say nothing: it is added to both sides of the score's ratio."""
 SMALLEST_SHARE, LARGEST_SHARE = 4e-4, 0.6
 """Shares of the image's pixels: smaller is no thing that a word names, larger is the surroundings."""
 TYPICAL_SHARE = 6e-3
-"""Scores of regions much smaller than this share are lowered: of two that last alike the larger is the thing."""
+"""Scores of regions much smaller than this share are lowered: of two that last as long, the larger is the thing."""
 LEAST_SCORE = 0.1
 ALIKE = 0.85
-"""A region that is more than this part of one above it in the tree is the same thing; the higher score stays."""
+"""A region that is more than this share of one above it in the tree is the same thing; the higher score stays."""
 MOST = 250
-"""Proposals of an image, the best by score."""
+"""At most so many proposals of an image, the best by score."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ class OpenCVProposer:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         tree = region_tree(small)
         chosen, scores = tree.lasting()
+        # With superpixels numbered so that each region is a run of them, its mask is two comparisons a pixel.
         place, runs = tree.runs()
         rank = place[tree.superpixels]
         masks = np.zeros((len(chosen), height, width), np.bool_)
@@ -104,6 +106,8 @@ class RegionTree:
 
     def runs(self) -> tuple[Labels, Labels]:
         """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
+        # Sizes from the leaves up, as parents come after their children; then places from the roots down, each region
+        # taking the next free ones of its parent.
         leaves = int(self.superpixels.max()) + 1
         size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
         for region, above in enumerate(self.parent.tolist()):
@@ -124,6 +128,7 @@ class RegionTree:
         score = 1 - (self.made + NOISE) / (np.maximum(gone, self.made) + NOISE)
         score *= np.sqrt(share / (share + TYPICAL_SHARE))
         kept = (share > SMALLEST_SHARE) & (share < LARGEST_SHARE) & (score > LEAST_SCORE)
+        # Of a chain of regions that hardly grow, one stays.
         for region in np.flatnonzero(kept):
             above = self.parent[region]
             while above >= 0 and ALIKE * self.area[above] < self.area[region]:
@@ -136,7 +141,7 @@ class RegionTree:
 
 
 def region_tree(image: NDArray[np.uint8]) -> RegionTree:
-    """image: (H, W, 3) uint8 RGB."""
+    """Superpixels of an image (H, W, 3) uint8 RGB, and all regions that they merge into, up to one for the image."""
     cv2 = require_cv2()
     lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
     lab[:, :, 0] *= LIGHTNESS
@@ -145,6 +150,7 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
     # Sums over the pixels of each region, so that a merger is an addition: how many, colors, their squares.
     regions = _sums(superpixels.ravel(), np.column_stack([np.ones(len(pixels)), pixels, pixels**2]))
     borders = _Borders.of(superpixels, lab)
+    # number: of each current region in the tree, which has at most 2 n - 1.
     count = len(regions)
     number, made = np.arange(count), np.zeros(2 * count - 1)
     parent, area = np.full(2 * count - 1, -1, np.int32), np.zeros(2 * count - 1)
@@ -155,10 +161,11 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
         a, b = borders.a[pairs], borders.b[pairs]
         new = np.arange(count, count + len(pairs))
         parent[number[a]] = parent[number[b]] = new
-        # What two regions became lies at least as far up as they: nested regions have nested heights.
+        # Distances may shrink as regions grow; the height of a merger never lies below those of its two regions.
         made[new] = np.maximum(distance[pairs], np.maximum(made[number[a]], made[number[b]]))
         area[new] = regions[a, 0] + regions[b, 0]
         count += len(pairs)
+        # b goes into a; then current regions are numbered 0, 1, ... again, and their sums and borders gathered.
         number[a] = new
         into = np.arange(len(number))
         into[b] = a
@@ -180,6 +187,7 @@ def _superpixels(lab: NDArray[np.float32]) -> Labels:
     side = max(4, round(CELL_SHARE * max(height, width)))
     cells = cv2.ximgproc.createSuperpixelSLIC(lab.astype(np.uint8), cv2.ximgproc.SLICO, side, 10.0)
     cells.iterate(4)
+    # A superpixel is a pair of a segment and a cell that occurs.
     both = segments.astype(np.int64) * cells.getNumberOfSuperpixels() + cells.getLabels()
     return np.unique(both, return_inverse=True)[1].reshape(height, width).astype(np.int32)
 
@@ -201,7 +209,7 @@ class _Borders:
         return cls(a, b, np.ones(len(a)), contrast).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
-        """The borders between what the regions became; a border inside one is gone."""
+        """The borders after regions were renumbered by ``into``: borders inside a region are gone, others add up."""
         count = int(into.max()) + 1
         a, b = into[self.a], into[self.b]
         between = a != b
@@ -218,7 +226,7 @@ def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
 
 
 def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
-    """Pixels whose right neighbor is another region, p of them: both regions, and the contrast there, each (p,)."""
+    """For the p pixels whose right neighbor is of another region: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)
     contrast = np.linalg.norm(lab[row, left] - lab[row, right], axis=1).astype(np.float64)
@@ -226,7 +234,8 @@ def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
 
 
 def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
-    """(e,): how far apart the two regions of each border are. regions: (n, 7) sums of pixels, colors, their squares."""
+    """(e,) distance of the two regions of each border. regions: (n, 7) number of pixels, sums of colors, and of their
+    squares."""
     a, b, area = borders.a, borders.b, regions[:, 0]
     mean, mean_squared = regions[:, 1:4] / area[:, None], regions[:, 4:] / area[:, None]
     texture = np.sqrt(np.maximum(mean_squared - mean**2, 0).sum(axis=1))
@@ -237,8 +246,9 @@ def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
 
 
 def _nearest_pairs(borders: _Borders, distance: Floats, count: int) -> NDArray[np.intp]:
-    """Borders whose two regions are each other's nearest, and of these the nearer third, so that the order of mergers
-    stays close to one at a time, nearest first. At least one."""
+    """Borders whose two regions are each other's nearest, and of these only the nearest third, at least one: so the
+    order of mergers stays close to that of merging the nearest pair each time."""
+    # By ranks, which have no ties.
     order = np.argsort(distance, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))

@@ -1,4 +1,4 @@
-"""The posed images of a capture folder, and masks drawn on them, to look at before a long run."""
+"""The posed images of a capture folder, and a sheet of masks drawn on them, to look at before a long run."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TINT = 0.55
 class Photograph:
     """A posed image. name: its view's. path: as the pose file says. file: where it is. camera: from world coordinates.
 
-    face: None where masks are made on the image as it is, and undistorted when they are read. Of an image that no
-    pinhole can show, the cube's face that this is: models know pinhole images, and no thing is cut at the border of a
-    panorama.
+    face: None where masks are made on the image as it is; they are undistorted when they are read. An image that no
+    pinhole can show is several photographs, each a face of a cube: models know pinhole images, and the border of a
+    panorama then cuts no thing in two.
     """
 
     name: str
@@ -80,7 +80,7 @@ def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], 
     """A PNG of images in a row, with their masks below. pictures: (H, W, 3) uint8 RGB and (H, W) ids of each."""
     cv2 = require_cv2()
     height, width = pictures[0][1].shape
-    size = CELL_WIDTH, max(1, round(2 * CELL_WIDTH * height / width))  # of the first for all: one camera, as a rule
+    size = CELL_WIDTH, max(1, round(2 * CELL_WIDTH * height / width))  # the first image's for all: mostly one camera
     cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in pictures]
     sheet = np.hstack([cv2.resize(cell, size, interpolation=cv2.INTER_AREA) for cell in cells])
     write_png(path, sheet)

@@ -1,7 +1,7 @@
-"""A folder of transformers -> its model, trusted with nothing but numbers.
+"""A folder of transformers -> its model; nothing is taken from the folder but numbers.
 
-Its config.json must name a type that is asked for, whose class is transformers' own: no code of the folder's (auto_map)
-is looked at. Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
+Its config.json must name a type that is asked for, whose class is transformers' own: code in the folder (auto_map) is
+not looked at. Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """SAM, SAM-HQ, SAM 2 and SAM 3 through transformers, without its image processors and without torchvision.
 
 What the processors would do is a few lines (`prepared`), with the numbers of the model's ``preprocessor_config.json``:
-SAM and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. SAM 3's points are answered by
-its tracker half; its words are in ``sam3``.
+SAM and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. Of SAM 3, the tracker half
+answers points; words are in ``sam3``.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> Loaded
 
 
 class SamPredictor:
-    """A `PointPredictor` on any of the four."""
+    """A `PointPredictor` on SAM, SAM-HQ, SAM 2 or SAM 3."""
 
     def __init__(self, name: str | os.PathLike[str]) -> None:
         self.loaded = load_sam(name, CLASSES)
@@ -110,10 +110,11 @@ class SamPredictor:
         preparation, device = self.loaded.preparation, self.loaded.device
         height, width = scaled_size(self.size, preparation)
         scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
-        asked = torch.from_numpy(points * scale)[None, :, None].to(device)
-        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=device)
+        asked = torch.from_numpy(points * scale)[None, :, None].to(device)  # (images, prompts, points each, xy)
+        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=device)  # 1: on the thing
         answer = self.loaded.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)
         logits = answer.pred_masks[0].float()
+        # Without what was padded.
         rows = max(1, round(logits.shape[-2] * height / preparation.side))
         columns = max(1, round(logits.shape[-1] * width / preparation.side))
         return logits[..., :rows, :columns].cpu().numpy(), answer.iou_scores[0].float().cpu().numpy()
@@ -140,7 +141,8 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 
 
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
-    """Side from the vision configuration, colors from the preprocessor's file where the model has one."""
+    """Side from the model's configuration, colors from the preprocessor's file where the folder has one, else those
+    that the published models were trained with."""
     sized = config.vision_config if kind in PADDED else getattr(config, "prompt_encoder_config", config)
     side = sized.image_size[0] if isinstance(sized.image_size, (list, tuple)) else sized.image_size
     stated = read_config(folder, "preprocessor_config.json", "processor_config.json")

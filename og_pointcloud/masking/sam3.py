@@ -1,8 +1,8 @@
 """SAM 3's words through transformers: a mask for each thing that a word names, in one image or followed through many.
 
-Words go through the model's own tokenizer.json, read as all of them are (`text.tokenizer`), and unpadded: padding is
-masked in the model. What transformers would fetch from elsewhere while it tracks is not fetched: without it tracks are
-not thinned out, which settling the masks of an image does.
+Words go through the model's own tokenizer.json, read like all others (`text.tokenizer`), and are not padded, as the
+model masks padding anyway. While it tracks, transformers would fetch code from elsewhere; it is kept from that. Without
+that code overlapping tracks are not thinned out, but settling the masks of an image does it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from og_pointcloud.masking.sam import LoadedModel, load_sam
 from og_pointcloud.text.tokenizer import open_tokenizer
 
 LEAST_SCORE = 0.5
-"""Below, a detection is none, as transformers' examples have it. Of a tracker its configuration says it."""
+"""Detections need this score, as in transformers' examples. A tracker takes it from its configuration."""
 TRACKS_OF_A_RUN = 1 << 32
+"""Tracks of a run are numbered from images_before times this on, so that no two runs share a number."""
 
 
 class NamedThings:
@@ -41,10 +42,11 @@ class NamedThings:
         model, masks, scores = self._loaded.model, [], []
         seen = model.get_vision_features(pixel_values=self._loaded.pixels(image))
         for tokens in self._tokens:
-            found = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
-            score = (found.pred_logits.sigmoid() * found.presence_logits.sigmoid())[0]
+            answer = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
+            # A query's score is how likely it is such a thing, times how likely the image shows any.
+            score = (answer.pred_logits.sigmoid() * answer.presence_logits.sigmoid())[0]
             kept = score > LEAST_SCORE
-            masks.append(found.pred_masks[0, kept].sigmoid() - 0.5)
+            masks.append(answer.pred_masks[0, kept].sigmoid() - 0.5)
             scores.append(score[kept])
         return _proposals(torch.cat(masks), torch.cat(scores), image)
 
@@ -53,11 +55,11 @@ class FollowedWords:
     """A proposer of what words name in images that come one after the other, which keeps the tracks of things."""
 
     def __init__(self, name: str | os.PathLike[str], words: Sequence[str], images_before: int = 0) -> None:
-        """As `NamedThings`, of a SAM 3 with its tracker. images_before: how many others have seen; tracks of a run that
-        begins elsewhere have other numbers."""
+        """As `NamedThings`, with a SAM 3 that has its tracker. images_before: how many images earlier runs have done,
+        so that tracks of this run have other numbers than theirs."""
         self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})
         self.name, self._first = f"sam:{name}", images_before * TRACKS_OF_A_RUN
-        # As after a failed attempt: it would fetch code and run it.
+        # The value that transformers sets when fetching has failed: else it would fetch code and run it.
         sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
         device, self._step = self._loaded.device, 0
         self._session: Any = transformers.Sam3VideoInferenceSession(
@@ -82,7 +84,7 @@ class FollowedWords:
         return _proposals(torch.cat(masks[1:] or masks), scores, image, self._first + np.array(tracks, np.int64))
 
     def _forget(self) -> None:
-        """What lies farther back than the tracker looks: an image takes 12 MB, a thing in it one."""
+        """Let go of what lies farther back than the tracker looks: an image takes 12 MB, each thing in it one more."""
         tracker = self._loaded.model.config.tracker_config
         oldest = self._step - max(tracker.max_object_pointers_in_encoder, tracker.num_maskmem)
         self._session.processed_frames.pop(self._step)
@@ -106,7 +108,7 @@ def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
 def _proposals(
     values: torch.Tensor, scores: torch.Tensor, image: NDArray[np.uint8], tracks: NDArray[np.int64] | None = None
 ) -> Proposals:
-    """Of masks (n, h, w), which are where values are above 0, those that have a pixel of the image."""
+    """Masks of values (n, h, w) above 0, at the image's size; those without a pixel are left out."""
     size = image.shape[:2]
     if not len(values):
         return Proposals(np.zeros((0, *size), np.bool_), np.zeros(0, np.float32), tracks)

@@ -1,6 +1,6 @@
-"""What is done for one image, proposals, an id map and features in one atomic work file; and this for many images.
+"""The work on one image, from proposals to an id map and features in a work file that is whole or absent; and on many.
 
-Models are opened once. One broken image stops no other; a run that is killed loses what it was working on alone.
+Models are opened once. A broken image stops no other; a run that is killed loses only the images in work.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from og_pointcloud.masking.photographs import Photograph
 
 
 class ImageTask(NamedTuple):
-    """A photograph, and where what it gives is kept until all are done."""
+    """A photograph, and the file in which its masks are kept until all images are done."""
 
     photograph: Photograph
     work_file: Path
@@ -35,7 +35,7 @@ class ImageWorker:
     """The models of a run."""
 
     def __init__(self, settings: MaskSettings, done: int = 0) -> None:
-        """done: images that earlier runs have done; of what they followed this one knows nothing."""
+        """done: images that earlier runs have done; tracks do not go on from these."""
         self.settings = settings
         folder = Path(settings.proposer)
         if folder.is_dir() and not settings.words:
@@ -45,7 +45,7 @@ class ImageWorker:
         self.encoder = open_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
 
     def __call__(self, task: ImageTask) -> str | None:
-        """Make the image's work file; what is wrong with the image, or None."""
+        """Make the image's work file; returns what is wrong with the image, or None."""
         try:
             image = task.photograph.read(self.settings.longest_side)
             with replacing(task.work_file) as file:
@@ -55,7 +55,8 @@ class ImageWorker:
         return None
 
     def _masks(self, image: NDArray[np.uint8], name: str) -> dict[str, Any]:
-        """The id map of the level that is asked for, and its masks' features."""
+        """The arrays of a work file: the id map of the level that is asked for, and features and tracks of its
+        masks."""
         proposer = self.proposer
         existing = isinstance(proposer, ExistingMasks)
         proposals = proposer.of(name, image.shape[:2]) if existing else proposer.propose(image)
@@ -113,8 +114,8 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
 
 
 def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
-    """What is wrong with each task's image (None: nothing), in their order. No task is no work, and no error.
-    done: images that earlier runs have done."""
+    """What is wrong with each task's image, None for nothing, in the order of the tasks. Without tasks no model is
+    opened. done: images that earlier runs have done."""
     if tasks:
-        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it ends after the images that are being made
+        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it waits for the images in work
             yield from pool.map(ImageWorker(settings, done), tasks)
