@@ -1,9 +1,9 @@
-"""What ``mesh.og`` does: labels as point arrays, words that select points, instances as blocks, boxes as lines.
+"""What ``mesh.og`` does: labels as point arrays, points selected by words, boxes of instances as lines.
 
 Point arrays: og_label (int32, row of og_names, -1 unknown), og_instance (int32, the scene's id, negative for none),
 og_score (float32), og_reason (uint8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
-Labels are of points. Where cells should carry them too, ``mesh.point_data_to_cell_data(categorical=True)`` has each
-cell's points vote.
+Labels are of points. For labels of cells, by the majority of their points, call
+``mesh.point_data_to_cell_data(categorical=True)``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from og_pointcloud.text.words import Labels, TextFeatures
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
-"""Pairs of `Box.corners`: they differ in one bit."""
+"""Pairs of numbers of `Box.corners`: the two ends of an edge differ in one bit, one axis."""
 
 
 def to_pyvista(result: Segmentation) -> pv.PolyData:
@@ -41,8 +41,8 @@ def to_pyvista(result: Segmentation) -> pv.PolyData:
 class OgDataSet:
     """``mesh.og``: ask what the points of any dataset are, by words.
 
-    The scene that answers is the one passed, else the file that the dataset says it came from. ``mesh.points`` are
-    taken to be in the scene's world coordinates.
+    The scene that answers is the one passed, else the file that the dataset says it came from. ``mesh.points`` must be
+    in the scene's world coordinates.
     """
 
     def __init__(self, mesh: pv.DataSet) -> None:
@@ -126,6 +126,7 @@ def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | No
     if not boxes:
         return pv.PolyData()
     ids, corners = np.array([*boxes], np.int32), np.concatenate([box.corners for box in boxes.values()])
+    # VTK lists the cells one after the other, each behind its number of points: 2, first, second.
     edges = (np.array(BOX_EDGES) + 8 * np.arange(len(ids))[:, None, None]).reshape(-1, 2)
     lines = pv.PolyData(corners, lines=np.insert(edges, 0, 2, axis=1).ravel())
     rgb = label_colors(ids) if colors is None else np.array([colors[instance] for instance in ids.tolist()], np.uint8)
@@ -135,7 +136,7 @@ def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | No
 
 
 def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
-    """Strings as field data. PyVista's own way refuses all that is not ASCII; VTK takes it, and so do its files."""
+    """Strings as field data, by VTK itself: PyVista refuses any that are not ASCII, VTK and its files do not."""
     from vtkmodules.vtkCommonCore import vtkStringArray
 
     strings = vtkStringArray()
@@ -153,7 +154,7 @@ def _attach(mesh: Any, result: Segmentation) -> None:
     set_strings(mesh, NAMES_FIELD, result.names)
     if result.scene is not None:
         set_strings(mesh, SCENE_FIELD, [scene_name(result.scene)])
-    elif SCENE_FIELD in mesh.field_data:  # of an earlier answer
+    elif SCENE_FIELD in mesh.field_data:  # left from an earlier answer
         mesh.field_data.remove(SCENE_FIELD)
 
 

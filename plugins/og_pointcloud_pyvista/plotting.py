@@ -1,4 +1,4 @@
-"""What ``plotter.og`` does: a segmented dataset in categories, boxes, and clicks that are answered in words."""
+"""What ``plotter.og`` does: it draws segmented datasets and boxes, and answers clicks in words."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ from og_pointcloud_pyvista.files import RGB
 UNKNOWN_COLOR = (205, 205, 205)
 """Lighter than in the data: most of a scene may be unknown, and what is known should stand out."""
 LEGEND_ENTRIES = 20
-"""Names that a legend has at most, the most frequent ones; one more entry counts the others."""
+"""At most so many names in a legend, the most frequent ones; one more entry counts the points of the others."""
 LEGEND_MARGIN = 0.015
 HIGHLIGHT = "magenta"
 SHADE = 0.5
-"""How much darker a label's color may become where the dataset's own colors are dark: keeps shape and shadow."""
+"""Share by which a label's color is darkened where the dataset's own color is black: shapes and shadows stay
+visible."""
 PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
 TEXT_SIZE = 11
 
 
 def can_render() -> bool:
-    """Whether VTK can draw off-screen here. Tried in a process of its own: with neither EGL nor OSMesa VTK crashes."""
+    """Whether VTK can draw off-screen here. Tried in a process of its own: VTK crashes where it has neither EGL nor
+    OSMesa."""
     if not os.environ.get("DISPLAY"):  # else VTK looks for an X server first, and complains
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     return subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False).returncode == 0
@@ -70,8 +72,8 @@ class OgPlotter:
     ) -> pv.Actor:
         """Draw a segmented dataset: a color a label, or ``by="instance"``, light gray where there is none.
 
-        legend: the labels with their numbers of points. names: a label's name on each of its instances; names that
-        would cover others are left out, those of large instances go first. point_size: pixels, for datasets of points.
+        legend: the labels with their numbers of points. names: a label's name on each of its instances, the largest
+        first; names that would cover others are left out. point_size: pixels, for datasets of points.
         options: of ``add_mesh``. Where the dataset has its own colors (RGB), they shade those of the labels.
 
         Returns the actor. Warns where no point has a label; OgPointcloudError for a dataset without points or labels.
@@ -192,7 +194,7 @@ class OgPlotter:
         )  # fmt: skip
 
     def _add_legend(self, labels: NDArray[np.integer], words: Sequence[str], colored: bool) -> None:
-        counts = np.bincount(labels + 1, minlength=len(words) + 1)
+        counts = np.bincount(labels + 1, minlength=len(words) + 1)  # first: unknown, -1
         order = [int(label) for label in np.argsort(-counts[1:], kind="stable") if counts[1 + label]]
         entries = [(f"{words[label]}  {counts[1 + label]:,}", _colors(np.array([label]))[0]) for label in order]
         if len(entries) > LEGEND_ENTRIES:
@@ -208,7 +210,8 @@ class OgPlotter:
             [[entry, text] for entry, _ in entries], face="none", loc=None, font_family="arial",
             bcolor=self._plotter.background_color, background_opacity=0.8,
         )  # fmt: skip
-        legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)  # `loc` leaves wide legends inside
+        # In the upper right corner, by hand: PyVista's `loc` puts wide legends too far inside.
+        legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)
         legend.SetPosition2(*size)
         # Words in the text's color beside a swatch: VTK by itself gives both the color of the swatch.
         for index, (_, color) in enumerate(entries if colored else []):
@@ -218,6 +221,7 @@ class OgPlotter:
         """Each labelled instance's word, the largest instances first."""
         ids = np.asarray(mesh.point_data[INSTANCE])
         labelled = (labels >= 0) & (ids >= 0)
+        # Labelled points sorted by instance, cut where the next one begins.
         order = np.argsort(ids[labelled], kind="stable")
         points, sorted_ids = np.asarray(mesh.points)[labelled][order], ids[labelled][order]
         present, first = np.unique(sorted_ids, return_index=True)
@@ -238,6 +242,8 @@ def _colors(ids: NDArray[np.integer]) -> NDArray[np.uint8]:
 
 
 def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
+    """Colors (n, 3) darkened where the dataset's own colors are dark, relative to its brightest ones; as they are
+    without such."""
     rgb = mesh.point_data.get(RGB)
     if rgb is None:
         return colors
@@ -248,7 +254,8 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
 
 
 def _drawable(mesh: Any) -> Any:
-    """Without the points that have no place, as VTK would draw nothing at all. OgPointcloudError where none is left."""
+    """The dataset without points that are not finite, which would make VTK draw nothing at all. OgPointcloudError where
+    none are left."""
     finite = np.logical_and.reduce(np.isfinite(np.asarray(mesh.points)), axis=1)
     if not finite.any():
         raise OgPointcloudError(
@@ -264,7 +271,7 @@ def _drawable(mesh: Any) -> Any:
 
 
 def _is_cloud(mesh: Any) -> bool:
-    """Whether it has no cells but vertices."""
+    """Whether a dataset has only vertices as cells, or none."""
     if isinstance(mesh, pv.PolyData):
         return mesh.n_verts == mesh.n_cells
     kinds = getattr(mesh, "celltypes", None)
@@ -273,7 +280,7 @@ def _is_cloud(mesh: Any) -> bool:
 
 
 def _middle_point(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The point nearest to the median of all: on the object, where the mean of a ring would lie beside it."""
+    """The point nearest to the median of all. It lies on the object; the mean of a ring's points would not."""
     return points[((points - np.median(points, axis=0)) ** 2).sum(axis=1).argmin()]
 
 

@@ -1,6 +1,6 @@
-"""A ROS 2 bag in, the same bag with labels out, without ROS: rosbags reads and writes, all else is ours.
+"""A ROS 2 bag in, the same bag with labels out, without ROS: rosbags reads and writes files and messages.
 
-The new bag holds all that the old one held, byte for byte, and beside each cloud its labels and its detections.
+The new bag holds all messages of the old one, byte for byte, and beside each cloud its labels and its detections.
 """
 
 from __future__ import annotations
@@ -35,17 +35,18 @@ CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
 LABELLED = "/labelled"
 OUTPUTS = {LABELLED: CLOUD, "/detections": DETECTION_ARRAY}
-"""What an output's topic adds to that of its cloud, and its type; in the order of `LabelledMessages`."""
+"""Ending of an output's topic, behind that of its cloud -> its type; in the order of `LabelledMessages`."""
 LABEL_INFO = "/og_pointcloud/label_info"
 BAG_VERSION = 8
-"""Of rosbag2's metadata: read by Humble and by all later releases."""
+"""Version of rosbag2's metadata, which Humble and all later releases read."""
 NO_TIME = QosTime(2147483647, 4294967295)
+"""ROS 2's infinite duration: no deadline, no lifespan."""
 LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, NO_TIME, NO_TIME,
     QosLiveliness.AUTOMATIC, NO_TIME, False,
 )  # fmt: skip
 NO_HASH = "RIHS01_" + "0" * 64
-"""Hash of a type that neither the bag nor we know: bags of Humble and older name types without defining them."""
+"""Hash of a type that neither the bag defines nor rosbags knows: bags of Humble and older only name types."""
 
 VISION_MSGS: Mapping[str, str] = {
     "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name",
@@ -66,9 +67,9 @@ VISION_MSGS: Mapping[str, str] = {
 
 @dataclass
 class BagReport:
-    """What ``label_bag`` did. topics: of each cloud's topic, that of its labels. seconds: wall clock spent on clouds.
+    """What ``label_bag`` did. topics: a cloud's topic -> the topic of its labels. seconds: wall clock spent on clouds.
 
-    skipped: clouds that could not be labelled, by reason. counts: points of each name.
+    skipped: number of clouds that could not be labelled, by reason. counts: number of points of each name.
     """
 
     topics: dict[str, str]
@@ -99,7 +100,7 @@ def label_bag(
     minimum_points: int = MINIMUM_POINTS,
     progress: bool = False,
 ) -> BagReport:
-    """Copy a ROS 2 bag and label its clouds, each at its place in the scene as /tf and /tf_static tell it.
+    """Copy a ROS 2 bag and label its clouds, each at its place in the scene by /tf and /tf_static.
 
     source: a bag's folder, .db3 or .mcap, its messages with zstd or without. target: the folder to make, of the same
     storage; it appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
@@ -114,14 +115,15 @@ def label_bag(
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
-        tree = transforms_of(reader, store)
+        tree = transforms_of(reader, store)  # all of them first: the transform after a cloud is needed, too
         messages = rosbags_messages(store)
         labeller = CloudLabeller(segmenter, messages, frame, minimum_points)
         with (
-            replacing_folder(target) as folder,  # a bag names its files after its folder
+            replacing_folder(target) as folder,  # of the target's name: a bag names its files after its folder
             Writer(folder, version=BAG_VERSION, storage_plugin=_storage(source)) as bag,
         ):
-            by_key = {(old.topic, old.msgtype): old for old in reader.connections}  # those that differ in QoS are one
+            # Publishers of one topic and type that differ in QoS are several connections; in the new bag they are one.
+            by_key = {(old.topic, old.msgtype): old for old in reader.connections}
             copies = {key: _copied(bag, old, store) for key, old in by_key.items()}
             info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
             names = to_label_info(segmenter.names, stamp=reader.start_time, messages=messages)
@@ -150,7 +152,7 @@ def _label(
         message = decoded(store, data, CLOUD)
         pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
         labelled = labeller(message, pose)
-    except Exception as error:  # one cloud, whatever is in it, does not cost the others
+    except Exception as error:  # one bad cloud, whatever is in it, does not cost the others
         kind = "" if isinstance(error, OgPointcloudError) else f"{type(error).__name__}: "
         report.skipped[kind + first_line(error)] += 1
         return None
@@ -188,7 +190,7 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
 
 
 def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
-    """A topic of the old bag in the new one."""
+    """The new bag's connection for a topic of the old one, with its type definition and QoS."""
     ext: Any = old.ext
     definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
     if not (old.msgdef.data and old.digest) and old.msgtype in store.types:
@@ -224,7 +226,7 @@ def transforms_of(reader: Reader, store: Any) -> TransformTree:
     for connection, _, data in messages_of(reader, connections) if connections else ():
         try:
             tree.add_message(decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
-        except Exception as error:  # decoded, but a nonsense still
+        except Exception as error:  # of decoding, or of values that are no transform
             damaged[first_line(error)] += 1
     if damaged:
         example = printable(next(iter(damaged)))
@@ -233,7 +235,7 @@ def transforms_of(reader: Reader, store: Any) -> TransformTree:
 
 
 def messages_of(reader: Reader, connections: Sequence[Connection] = ()) -> Iterator[tuple[Connection, int, bytes]]:
-    """Topic, stamp in nanoseconds and bytes of each message, of these connections alone if any are named."""
+    """Connection, stamp in nanoseconds and bytes of each message; of all connections where none are named."""
     try:
         yield from reader.messages(connections)
     except Exception as error:  # of rosbags or of its databases
@@ -249,7 +251,7 @@ def decoded(store: Any, data: bytes, kind: str) -> Any:
 
 
 def _storage(source: Path) -> StoragePlugin:
-    """That of the source, which is a file of one storage or a folder of them."""
+    """The storage of the source, which is a file of it or a folder of such files."""
     files = [source] if source.is_file() else list(source.iterdir())
     return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
 

@@ -30,11 +30,11 @@ def to_detections(
     """The labelled instances that points of ``result`` lie on, as vision_msgs/Detection3DArray.
 
     Each has its label's name as class id, its score, its instance id as id, and the oriented box of the whole instance
-    as the scene knows it, of which the result may show only a part.
-    instances: a scene, or ``og.instance_table(scene, up=(0, 0, 1))`` of it for boxes that stand upright; keep it, for
-    every box is worked out once. result: what ``segment`` or a ``Segmenter`` said of a cloud of the same scene.
+    as the scene knows it; the result may show only a part of that.
+    instances: a scene, or ``og.instance_table(scene, up=(0, 0, 1))`` of it for boxes that stand upright; keep the
+    table, as it computes each box once. result: what ``segment`` or a ``Segmenter`` said of a cloud of the same scene.
     frame_id: the scene's frame. stamp: a Time message, or nanoseconds since the epoch.
-    minimum_points: points that an instance has in the result, or it is left out.
+    minimum_points: an instance with fewer points in the result is left out.
     """
     table = instances.instances if isinstance(instances, LabelledScene) else instances
     labelled = np.flatnonzero(result.labels >= 0)
@@ -43,8 +43,9 @@ def to_detections(
         raise OgPointcloudError(
             f"the result has instance {owners.max()}, the table {len(table)}: they are of two scenes"
         )
+    # A row of the result for each instance. Any will do: all points of an instance have one label and score.
     example = np.zeros(len(table), np.int64)
-    example[owners] = labelled  # any point will do: all of an instance have one label and score
+    example[owners] = labelled
     seen = np.flatnonzero(np.bincount(owners, minlength=len(table)) >= max(minimum_points, 1))
     head = header(messages, frame_id, stamp)
     detections = [
@@ -74,8 +75,8 @@ def to_label_info(
 def to_objects(
     objects: Sequence[MapObject], frame_id: str = "map", stamp: Any = None, *, messages: MessageFactory = plain_messages
 ) -> Any:
-    """What a map knows (`Mapper.objects`), as vision_msgs/Detection3DArray: the object's id, its box along the axes of
-    the map's frame, and its state as class id: present, moved, unseen, or gone (then where it was last)."""
+    """The objects of a map (`Mapper.objects`) as vision_msgs/Detection3DArray: the object's id, its box along the axes
+    of the map's frame, and its state as class id: present, moved, unseen, or gone, then with its last box."""
     head = header(messages, frame_id, stamp)
     boxes = ((entry, Box(entry.place, entry.size, np.eye(3))) for entry in objects)
     detections = [_detection(entry.id, box, entry.state, 1.0, head, messages) for entry, box in boxes]

@@ -1,8 +1,8 @@
 """Messages of one stamp -> a frame of a map: depth and color images, masks with features, the camera.
 
-Depth is 16UC1 in millimeters or 32FC1 in meters. Masks are 16UC1 or 32SC1: 0 none, else a number from 1 that means
-something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask: what the encoder saw of masks 1,
-2, ... CameraInfo is of rectified images.
+Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 16UC1 or 32SC1: 0 none, else a number from 1 on
+that means something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask, the encoder's
+features of masks 1, 2, ... CameraInfo is of rectified images.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 from og_pointcloud_ros.pointcloud2 import read_fields
 
 WHOLE = ("depth", "masks", "features")
-"""What a frame waits for."""
+"""Roles of messages that a frame waits for."""
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8": "u1", "bgr8": "u1", "mono8": "u1"}
 
 
@@ -33,6 +33,7 @@ def image_array(message: Any) -> NDArray[Any]:
     kind = np.dtype(ENCODINGS[encoding]).newbyteorder(">" if message.is_bigendian else "<")
     data = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8)
     channels = 3 if encoding in ("rgb8", "bgr8") else 1
+    # A line may be longer than its pixels: step counts the padding, too.
     line = message.width * channels * kind.itemsize
     if message.step < line or len(data) < message.step * message.height:
         raise SceneError(f"image has {len(data)} bytes, {message.step} a line; expected {message.height} of {line}")
@@ -44,7 +45,7 @@ def image_array(message: Any) -> NDArray[Any]:
 
 @dataclass
 class _Parts:
-    """What has come of one stamp. frame_id: of the camera."""
+    """The messages of one stamp that have come so far. frame_id: of the camera."""
 
     frame_id: str = ""
     depth: NDArray[Any] | None = None
@@ -64,7 +65,7 @@ class FrameAssembler:
     def add(self, role: str, message: Any) -> None:
         """Take a message of a role: "info" or a field of `_Parts`. SceneError for what it is not."""
         stamp = nanoseconds(message.header.stamp)
-        if role == "info":
+        if role == "info":  # the lens does not change from frame to frame: the latest one serves all
             self._info = message
             return
         parts = self.waiting.setdefault(stamp, _Parts())
@@ -85,9 +86,10 @@ class FrameAssembler:
         return self._info is not None and all(getattr(parts, role) is not None for role in self.whole)
 
     def frame(self, stamp: int, pose: Callable[[str, int], NDArray[np.float64]]) -> Frame | None:
-        """The frame of a stamp, from what has come of it; None where that shows nothing. Call `forget` when it is used.
+        """The frame of a stamp, from what has come of it; None where that is neither depth nor masks with features.
+        Call `forget` when it is used.
 
-        pose: (frame id, stamp) -> (4, 4) from there to the map; what it raises is raised. SceneError without a camera.
+        pose: (frame id, stamp) -> (4, 4) from there to the map; its errors are passed on. SceneError without a camera.
         """
         parts = self.waiting[stamp]
         has_masks = parts.masks is not None and parts.features is not None
@@ -98,7 +100,8 @@ class FrameAssembler:
         camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
         depth = parts.depth
         if depth is not None and depth.dtype.kind == "u":
-            depth = depth.astype(np.float32) * np.float32(1e-3)
+            depth = depth.astype(np.float32) * np.float32(1e-3)  # millimeters
+        # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
         masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
         features = parts.features if has_masks else None
         return Frame(camera, masks, features, depth, rgb=parts.color, stamp=stamp / NANOSECONDS)

@@ -14,9 +14,9 @@ from og_pointcloud_ros.messages import MessageFactory
 from og_pointcloud_ros.pointcloud2 import from_pointcloud2, read_fields, to_pointcloud2
 
 UP = (0.0, 0.0, 1.0)
-"""Axis that boxes stand upright on: that of REP 103, which ROS frames follow."""
+"""Axis that boxes stand upright on: z is up in ROS frames (REP 103)."""
 MINIMUM_POINTS = 10
-"""Points of an instance in a cloud from which it is a detection, and no speck."""
+"""An instance with fewer points in a cloud is a speck and no detection."""
 
 
 class LabelledMessages(NamedTuple):
@@ -28,10 +28,10 @@ class LabelledMessages(NamedTuple):
 
 
 class CloudLabeller:
-    """Labels PointCloud2 messages one by one; words are scored, and boxes worked out, once.
+    """Labels PointCloud2 messages one by one; words are scored, and boxes computed, once.
 
     segmenter: of the scene, may be replaced by one of other labels.
-    frame: the scene's frame, which detections are given in. minimum_points: of an instance, to be a detection.
+    frame: the scene's frame, which detections are given in. minimum_points: that an instance needs to be a detection.
     """
 
     def __init__(
@@ -44,12 +44,13 @@ class CloudLabeller:
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
 
-        The labelled cloud keeps the frame, stamp and coordinates of the message, so that whatever matches the two by
-        time, or shows them by tf, finds them in one place.
+        The labelled cloud keeps the frame, stamp and coordinates of the message, so that tools that match the two by
+        time, or show them by tf, find them in one place.
         """
         xyz = from_pointcloud2(message)
         result = self.segmenter(xyz, pose)
         head = message.header
+        # Coordinates are written in float64 where they came so: those of a map may lie far from 0.
         kind = read_fields(message).dtype
         double = any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
         points = to_pointcloud2(result, head.frame_id, head.stamp, xyz=xyz, double=double, messages=self._messages)

@@ -1,7 +1,7 @@
 """Frames of a map from a ROS 2 bag, without ROS: depth and color images, masks with features, poses from tf.
 
-Topics are told by type and name. Images whose name has "depth" are depth, those with "mask" are masks, other color
-ones are color; a PointCloud2 whose name has "feature" brings features (`frames`). Messages of one stamp are one frame.
+Topics are known by type and name: an Image with "depth" in its topic's name is depth, one with "mask" is masks, any
+other is color; a PointCloud2 with "feature" brings features (`frames`). Messages of one stamp are one frame.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ PENDING = 100
 
 
 class BagFrames:
-    """Iterates over the frames of a bag. frame: what tf calls the map. dropped: frames that could not be used, by why.
+    """Iterates over the frames of a bag. frame: what tf calls the map. dropped: reason -> number of frames that could
+    not be used.
 
     SceneError where the bag has no depth, no masks, or no camera_info.
     """
@@ -42,6 +43,7 @@ class BagFrames:
                     assembler.add(role, decoded(store, data, connection.msgtype))
                 except (OgPointcloudError, ValueError) as error:
                     self._drop(f"{role}: {error}")
+                # Frames that are whole; else the oldest of too many that wait, with what has come of them.
                 ready = [*filter(assembler.is_whole, assembler.waiting)]
                 for stamp in ready or sorted(assembler.waiting)[:-PENDING]:
                     yield from self._made(stamp, assembler, tree)

@@ -6,8 +6,9 @@ Publishes ~/objects (vision_msgs/Detection3DArray, latched) after each frame: id
 present, moved, unseen or gone. Serves ~/save, ~/load and ~/reset (std_srvs/Trigger): the map to and from the file that
 the parameter ``map`` names, and an empty one.
 
-Frames go through a queue into a thread of its own, so that no sensor waits; what gets too old there, or waits too long
-for its masks or transform, is dropped or used as it is, and said to be. No message ends the node.
+Frames go through a queue into a thread of its own, so that no sensor waits. Those that get too old there are dropped,
+and so are those whose transform does not come; those that wait too long for their masks are used without. Every drop is
+logged. No message ends the node.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class MapNode(PlacedNode):
                 if (frame := self._assembler.frame(stamp, self._pose)) is not None:
                     self._queue.put(frame)
             except TransformException as error:
-                if not is_old:
+                if not is_old:  # tf is often a little later: it is asked again
                     continue
                 self._warn(f"a frame was dropped, its transform did not come within {self._max_age} s: {error}")
             except Exception as error:

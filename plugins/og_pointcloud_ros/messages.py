@@ -1,7 +1,7 @@
 """ROS messages without ROS: ways to make one.
 
 Whatever makes messages here takes a ``MessageFactory``, so that the same lines fill plain objects, rosbags' types
-(``bags.rosbags_messages``) and rclpy's. Reading needs none of this: messages are told by their attributes.
+(``bags.rosbags_messages``) and rclpy's. Reading needs no factory: a message is whatever has its attributes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def ros_messages(type_name: str, /, **fields: Any) -> Any:
     """The message types of a ROS 2 installation, which are imported here and only here."""
     package, _, name = type_name.partition("/msg/")
     kind = getattr(importlib.import_module(f"{package}.msg"), name)
-    # An array.array of bytes is taken over as it is; anything else is checked byte by byte.
+    # rclpy takes an array.array of bytes as it is; anything else it checks byte by byte.
     for key, value in fields.items():
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
             fields[key] = array.array("B", value.tobytes())

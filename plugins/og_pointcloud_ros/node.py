@@ -44,13 +44,13 @@ PARAMETERS = {
 }
 """With their defaults; config/parameters.yaml explains them. An empty list has no type in ROS, hence [""]."""
 RETRY_S = 0.02
-"""How often a waiting cloud asks for its transform: tf is often a little later than the cloud."""
+"""Seconds between two tries to find a waiting cloud's transform: tf is often a little later than the cloud."""
 QUIET_S = 5.0
-"""Seconds between two warnings."""
+"""Seconds between two warnings at least."""
 
 
 class PlacedNode(Node):
-    """What both nodes do: they know their parameters, find where messages were taken, and see to what waits for that.
+    """What both nodes share: parameters, poses of messages from tf, and a timer for messages that wait for their pose.
 
     parameters: with their defaults, ``target_frame`` and ``max_age`` among them.
     """
@@ -68,7 +68,7 @@ class PlacedNode(Node):
         return self.get_parameter(name).value
 
     def _work(self) -> None:
-        """See to what waits."""
+        """Try again what waits; called every RETRY_S seconds."""
         raise NotImplementedError
 
     def _pose_at(self, head: Any) -> NDArray[np.float64]:
@@ -123,7 +123,7 @@ class SegmentNode(PlacedNode):
         self.get_logger().info(f"{len(names)} labels: {', '.join(names)}")
 
     def _on_parameters(self, parameters: Sequence[Any]) -> Any:
-        """Refuses what cannot be used, with the reason, before it is set."""
+        """Take over new labels; refuse, with the reason, what cannot be used, before it is set."""
         for parameter in parameters:
             if parameter.name in PARAMETERS and parameter.name != "labels":
                 return SetParametersResult(successful=False, reason=f"{parameter.name} is read at the start only")
@@ -163,12 +163,13 @@ class SegmentNode(PlacedNode):
 
 
 def error_text(error: Exception) -> str:
-    """An error of ours says what is wrong and what helps; of another the kind is worth knowing."""
+    """Its message; of an error that is not of this library, which says little by itself, the type as well."""
     return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
 
 def latest_only(reliability: Any, latched: bool = False, depth: int = 1) -> Any:
-    """The newest message alone, or the newest ``depth``. A reliable publisher serves subscribers of both kinds."""
+    """QoS that keeps only the newest message, or the newest ``depth``. A reliable publisher serves reliable and best
+    effort subscribers; a best effort subscriber hears publishers of both kinds."""
     durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
 

@@ -1,7 +1,7 @@
 """sensor_msgs/PointCloud2 <-> arrays, in numpy alone.
 
 A message is whatever has a PointCloud2's attributes: one of rclpy, of rosbags (ROS 1 or 2), or a plain object. Its
-sizes are believed only where they agree with each other and with the data.
+stated sizes are used only after they are found to agree with each other and with the data.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
 UNLABELLED = 65535
-"""Label of a point without one, as vision_msgs/LabelInfo has it for 16-bit ids."""
+"""Label of a point without one: what vision_msgs/LabelInfo keeps for that among 16-bit ids."""
 ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "data")
 TYPE_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's datatypes."""
@@ -91,7 +91,7 @@ def to_pointcloud2(
 ) -> Any:
     """A labelled cloud as sensor_msgs/PointCloud2: fields x y z rgb label instance score, 28 bytes a point.
 
-    label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` tells the names). instance: int32, -1
+    label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` gives the names). instance: int32, -1
     background, -2 unobserved, -3 too far. score: float32. rgb: a color a label, packed as PCL packs it.
     stamp: a Time message, or nanoseconds since the epoch. messages: the library whose message is made.
     xyz: (N, 3) coordinates in frame_id, where that is not the scene's world: the cloud as the sensor gave it.
@@ -100,6 +100,7 @@ def to_pointcloud2(
     xyz = result.xyz if xyz is None else xyz
     if xyz.shape != (len(result), 3):
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
+    # One sub-array for x, y, z is filled at once; a view of the same bytes names the three.
     place = "<f8" if double else "<f4"
     colors = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
     rows = np.empty(len(result), [("xyz", place, 3), *colors])

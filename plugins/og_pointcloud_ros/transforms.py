@@ -1,7 +1,7 @@
-"""A tree of frames over time, as /tf and /tf_static tell it: where one frame lies in another at a moment.
+"""A tree of frames over time, made from /tf and /tf_static: where one frame lies in another at a moment.
 
-Offline all transforms are known beforehand, so a moment between two of them is interpolated: places on a straight line,
-rotations on the shortest arc. Before the first and after the last nothing is guessed.
+A moment between two transforms is interpolated: places on a straight line, rotations on the shortest arc. Offline that
+is always possible, as all transforms are known beforehand. Before the first and after the last nothing is guessed.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 LEAST_LENGTH = 1e-6
-"""Of a quaternion that still says how something is turned."""
+"""Length below which a quaternion says nothing of a rotation."""
 MOST_FRAMES = 1000
-"""Frames that may hang on each other; robots have tens."""
+"""Length of a chain of frames, each in the next; robots have tens."""
 NEARLY_EQUAL = 1 - 1e-8
-"""Cosine of half the angle between two rotations above which the arc is a straight line, to rounding."""
+"""Cosine of half the angle between two rotations above which the arc is straight, but for rounding."""
 
 
 class TransformError(OgPointcloudError):
@@ -31,7 +31,7 @@ class TransformError(OgPointcloudError):
 
 @dataclass
 class _Edge:
-    """A frame in its parent: translation (3,) and unit quaternion x y z w, one each a stamp; static without stamps."""
+    """Where a frame lies in its parent: translation (3,) and unit quaternion x y z w at each stamp, ascending."""
 
     parent: str
     stamps: list[int] = field(default_factory=list)
@@ -40,7 +40,7 @@ class _Edge:
 
 
 class TransformTree:
-    """Frames by name, with a leading slash or without. Every frame has one parent; the last one told counts."""
+    """Frames by name, with a leading slash or without. Every frame has one parent, the latest that was added."""
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
@@ -54,7 +54,7 @@ class TransformTree:
         self, parent: str, child: str, translation: ArrayLike, rotation_xyzw: ArrayLike, stamp: int = 0, *,
         static: bool = False,
     ) -> None:  # fmt: skip
-        """Tell where child lies in parent: p_parent = R p_child + translation. stamp: nanoseconds.
+        """Add where child lies in parent: p_parent = R p_child + translation. stamp: nanoseconds.
 
         A static transform holds at all times. TransformError for NaN, infinity, or a quaternion of length 0.
         """
@@ -66,9 +66,11 @@ class TransformTree:
                 "numbers and a rotation of length 1"
             )
         parent, child = parent.lstrip("/"), child.lstrip("/")
+        # A static transform replaces what was known, and so does another parent.
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent or edge.static != static or static:
             edge = self._edges[child] = _Edge(parent, static=static)
+        # In order of time, whatever the order of messages; of one stamp the later message counts.
         at = bisect_left(edge.stamps, stamp)
         repeated = at < len(edge.stamps) and edge.stamps[at] == stamp
         edge.stamps[at : at + repeated] = [stamp]
@@ -86,6 +88,7 @@ class TransformTree:
     def lookup(self, target: str, source: str, stamp: int) -> NDArray[np.float64]:
         """(4, 4) float64 that takes coordinates of source to target at that moment, nanoseconds."""
         target, source = target.lstrip("/"), source.lstrip("/")
+        # Both chains of parents, up to the first frame that they share: out of the source, and into the target.
         down, up = self._to_root(source), self._to_root(target)
         if source != target and not set(down) & set(up):
             missing = [repr(frame) for frame in (target, source) if frame not in self.frames]
@@ -112,7 +115,7 @@ class TransformTree:
         return path
 
     def _chain(self, frames: list[str], stamp: int) -> NDArray[np.float64]:
-        """Coordinates of the first frame in the parent of the last."""
+        """(4, 4) from coordinates of the first frame to those of the last one's parent; the identity without frames."""
         matrix = np.eye(4)
         for frame in frames:
             matrix = self._pose(frame, stamp) @ matrix
@@ -141,7 +144,7 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
     cosine = float(first @ second)
     if cosine < 0:  # q and -q are one rotation
         second, cosine = -second, -cosine
-    if cosine > NEARLY_EQUAL:
+    if cosine > NEARLY_EQUAL:  # the sines below would be 0 / 0
         mixed = first + share * (second - first)
         return mixed / np.linalg.norm(mixed)
     angle = np.arccos(cosine)
