@@ -45,7 +45,7 @@ def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator
                 file.flush()
                 if durable:
                     os.fsync(file.fileno())
-        os.replace(temporary, path)
+        os.replace(temporary, path)  # in one step: whoever opens the path finds the old file or the new one, whole
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
@@ -69,6 +69,7 @@ def replacing_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -
     error. overwrite: it may take the place of a folder that is there; else there must be none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    # What killed runs have left: nobody holds its lock.
     for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
         if old.is_dir() and not old.is_symlink():
             with suppress(OgPointcloudError), locked(old):

@@ -150,6 +150,7 @@ def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> Captur
 
 def _stated_poses(capture: Path) -> CapturePoses:
     """The images as pose files list them."""
+    # Pose files that someone made for this capture come first; the folder of a data set is tried last.
     size_of, is_recording = partial(_size_of_image, capture), False
     if (file := next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)) is not None:
         source, frames = file, read_transforms(file, size_of)
@@ -241,6 +242,7 @@ def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLa
     stored = dict(zip(distinct, read, strict=True))
     # Faces of one image share its decoded map.
     latest = lru_cache(maxsize=DECODED)(lambda name: stored[name].read())
+    # Masks of a whole image are cut to the view; those that a cube's face has of its own are of its pixels already.
     return [
         _layer_of(face, replace(stored[name], read=partial(latest, name)), view)
         if face and (not face.name or name != view)
@@ -256,6 +258,7 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     size = scaled.camera.width, scaled.camera.height
     if not face.name:  # the one view of an image shows all of its masks
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
+    # Which masks a face shows decides its features: the map is read now, and once more when it is asked for.
     ids = scaled.mask_ids(layer.read())
     if (last := ids.max(initial=-1)) >= len(layer.features):
         raise SceneError(
@@ -384,7 +387,7 @@ def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
 
 def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint8]:
     """(H, W, 3): the photograph's colors at the pixels of the depth camera, averaged down to its resolution first."""
-    scale = min(1.0, camera.fx / image.camera.fx)
+    scale = min(1.0, camera.fx / image.camera.fx)  # of the photograph, so that a pixel spans the same angle as depth's
     size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
     photographed = image.camera.resized(*size)
     return resampled(read_photograph(file, photographed, image.face), photographed, camera)

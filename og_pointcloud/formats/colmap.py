@@ -83,7 +83,7 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
         with naming(f"{model}, image '{name:.60}'"):
             camera_at, lens = cameras[camera_id]
             camera = camera_at(pose_of_quaternion(pose[:4], pose[4:]))
-        images.append(PosedImage(name.replace("\\", "/"), camera, lens))
+        images.append(PosedImage(name.replace("\\", "/"), camera, lens))  # models made on Windows
     if not images:
         raise SceneError(f"{model}: the images file lists 0 images; expected at least one registered image")
     return tuple(images)

@@ -59,7 +59,7 @@ class DepthFile:
         require_scaled(f"{self.path} is", (width, height), (self.camera.width, self.camera.height))
         whole = np.issubdtype(stored.dtype, np.integer)
         unit = (MILLIMETRE if whole else 1.0) if self.unit is None else self.unit
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN and what overflows are not measured
             depth = np.asarray(stored, np.float32) * np.float32(unit)
             measured = np.isfinite(depth) & (depth > 0)
         if self.invalid is not None:
@@ -98,6 +98,7 @@ def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
     """
     columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
     rows = _positions(target.height, target.fy, target.cy, source.fy, source.cy)
+    # Lines beyond the source's border are picked from the border, and then set to 0.
     seen = (columns >= 0) & (columns < source.width), (rows >= 0) & (rows < source.height)
     picked = values[np.ix_(np.clip(rows, 0, source.height - 1), np.clip(columns, 0, source.width - 1))]
     picked[:, ~seen[0]] = 0

@@ -80,7 +80,7 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
     with _opened(path) as (_, file):
         for number, image in enumerate(_children(file.root(), "images2D")):
             name = _text(image, "name") or f"image {number}"
-            try:
+            try:  # an image that cannot be used does not cost the others
                 frames.append(_unpack_image(image, folder, f"{number:04d}_{_slug(name)}", path.stat().st_size))
             except SceneError as error:
                 unused.append(f"{name:.60}: {error}")
@@ -127,7 +127,7 @@ def _text(node: Any, name: str) -> str:
 def _number(node: Any, name: str) -> float:
     if not node.isDefined(name):
         raise SceneError(f"it has no {name}")
-    field = node[name]
+    field = node[name]  # a float, an integer, or an integer that counts steps of a scale
     value = float(field.scaledValue() if hasattr(field, "scaledValue") else field.value())
     if not abs(value) < 1e30:
         raise SceneError(f"its {name} is {value}; expected a finite number")

@@ -113,7 +113,7 @@ def faces(whole: Camera, lens: Lens) -> tuple[Face, ...]:
     made = []
     for name, (left, top, right, bottom) in boxes.items():
         pose = whole.world_to_camera.copy()
-        pose[:3] = CUBE[name or "front"] @ pose[:3]
+        pose[:3] = CUBE[name or "front"] @ pose[:3]  # turned about the camera's center: the translation turns with it
         shrunk = np.pi / 4 if name else 1.0  # a cube's face is 2 wide for an arc of pi / 2
         fx, fy = whole.fx * shrunk, whole.fy * shrunk
         width, height = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))

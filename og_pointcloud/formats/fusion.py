@@ -125,6 +125,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
                 "check the poses and the depth unit"
             )
         refused += int((~stays).sum())
+        # Points have moved: those that share a voxel now become one.
         voxels = _Voxels(found.voxel)
         voxels.add(moved[stays], rgb[stays], "the fused cloud")
     xyz, rgb = voxels.means()
@@ -222,7 +223,7 @@ def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) 
     """(n, 3) float64 world coordinates of the chosen pixels, row by row, their depths times ``factor``."""
     camera = image.camera
     rows, columns = np.nonzero(chosen)
-    z = image.depth[chosen] * np.float64(factor)
+    z = image.depth[chosen] * np.float64(factor)  # along the axis; pixel centers at +0.5
     x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
     rotation, center = camera.world_to_camera[:3, :3], camera.center
     return np.column_stack(
@@ -235,6 +236,7 @@ def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
     depths taken times ``factor``."""
     found = [np.zeros(0)]
     for index, image in enumerate(images):
+        # About SAMPLES measured pixels, evenly spread; each is looked up in all other images.
         sampled = np.zeros(image.depth.shape, bool)
         rows = np.flatnonzero(image.depth)
         sampled.reshape(-1)[rows[:: 1 + len(rows) // SAMPLES]] = True
@@ -329,6 +331,7 @@ class _Voxels:
                 f"{source} has points {farthest:.3g} from the middle of the cameras, in voxels of {self._edge:.3g}; "
                 f"expected fewer than {VOXELS_ACROSS // 2} voxels: check its pose and the depth unit"
             )
+        # Indices from 0 on, 21 bits each, as one number.
         x, y, z = (np.floor(xyz / self._edge).astype(np.int64) + VOXELS_ACROSS // 2).T
         keys = (x * VOXELS_ACROSS + y) * VOXELS_ACROSS + z
         self._waiting.append((keys, np.column_stack([xyz, rgb, np.ones(len(xyz))])))
@@ -358,6 +361,7 @@ def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], 
 def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
     """A warning, with the cure, where views agree clearly better if all depths are taken in another unit, or agree in
     no unit; None where neither is so."""
+    # Poses keep their unit, so that only the right one makes depths agree.
     images = [image for frame in evenly(frames, COMPARED) if (image := frame.depth.read()).depth.any()]
     shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNITS)}
     best = max(UNITS, key=shares.__getitem__)

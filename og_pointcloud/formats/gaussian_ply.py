@@ -110,6 +110,7 @@ def _compressed(elements: Elements) -> Points:
             f"{len(vertex)} packed splats in {len(chunk)} chunks of {SPLATS_PER_CHUNK}; expected {expected} chunks: "
             "the file is damaged"
         )
+    # Each word holds its fields from the highest bit down, as shares of the chunk's bounds.
     words = {}
     for name in ("packed_position", "packed_rotation", "packed_scale", "packed_color"):
         if name not in (vertex.dtype.names or ()) or vertex.dtype[name] != np.uint32:

@@ -66,6 +66,7 @@ def write_gltf(
             raise SceneError("0 points; expected at least one: glTF has no empty clouds")
         require_finite(xyz_world, LABEL_FINITE)
         of_splats = {} if splats is None else _splat_columns(splats, rgb)
+        # float32 around the median: world coordinates far from 0 would lose millimeters.
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
         columns = {"POSITION": (xyz_world - origin).astype(np.float32), "COLOR_0": _linear_colors(rgb, splats)}
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
@@ -102,7 +103,7 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
     if len(splats) != len(rgb):
         raise SceneError(f"{len(splats)} Gaussians for {len(rgb)} labels; expected as many")
     columns = {
-        "ROTATION": rotation[:, [1, 2, 3, 0]],
+        "ROTATION": rotation[:, [1, 2, 3, 0]],  # from w x y z
         "SCALE": scale,
         "OPACITY": opacity,
         "SH_DEGREE_0_COEF_0": ((rgb / 255 - 0.5) / SH_CONSTANT).astype(np.float32),
@@ -169,7 +170,7 @@ def _feature_sets(
         count = max(len(np.unique(ids[ids >= 0])), 1)  # at least 1, as the schema has it
         feature_sets.append({"featureCount": count, "nullFeatureId": len(texts), "attribute": index, "label": name})
         encoded = [text.encode() for text in texts]
-        if any(encoded):
+        if any(encoded):  # len(texts) + 1 offsets, the last one the end
             offsets = np.cumsum([0, *map(len, encoded)]).astype("<u4").tobytes()
             places = {"values": buffer.add(b"".join(encoded)), "stringOffsets": buffer.add(offsets)}
             classes[name] = {"properties": {NAME: {"type": "STRING"}}}
@@ -193,7 +194,7 @@ def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[st
     }
     if column.dtype == np.uint16:
         accessor["normalized"] = True
-    if with_bounds:
+    if with_bounds:  # which the specification demands of positions
         accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
     return accessor
 

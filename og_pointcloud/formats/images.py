@@ -61,7 +61,7 @@ def find_image(capture: Path, path: str) -> Path | None:
     path that leads out of the capture folder is never opened: its file name is looked for in the image folders.
     """
     inside = posixpath.normpath(path)
-    if inside.startswith(("/", "..")):
+    if inside.startswith(("/", "..")):  # absolute paths of the machine that wrote the file, or worse
         inside = posixpath.basename(inside)
     for folder in ("", *IMAGE_FOLDERS):
         file = capture / folder / inside
@@ -164,6 +164,7 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
+    # Before OpenCV takes memory for the pixels.
     if stated := stated_size(io.BytesIO(data.tobytes())):
         _check_pixels(file, *stated)
     try:

@@ -64,6 +64,7 @@ def _images_folder(folder: Path, drive: str, camera: str) -> Path:
 
 def _poses_of_drive(folder: Path) -> Path:
     files = sorted(folder.glob("data_poses/*/cam0_to_world.txt"))
+    # Poses come for all drives at once, images drive by drive.
     seen = [file for file in files if _images_folder(folder, file.parent.name, "00").is_dir()]
     if len(seen) != 1:
         drives = ", ".join(file.parent.name for file in seen[:3]) or "none"

@@ -70,6 +70,7 @@ def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
             f"{len(features)}): write both files in one run"
         )
     used = np.flatnonzero(np.bincount(ids.reshape(-1) + 1, minlength=1)[1:])  # without id -1
+    # Old id -> row among those that are kept.
     row_of_id = np.full(highest + 2, -1, np.int32)  # the last entry serves id -1
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
     height, width = ids.shape

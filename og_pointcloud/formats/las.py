@@ -142,7 +142,7 @@ def _points_of(source: Path, count: int) -> LasData:
             raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
     own = [name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS]
-    if "og_label" in own:  # its class would be taken for one of the new labels
+    if "og_label" in own:  # an earlier run's class would be taken for one of the new labels
         las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
     las.remove_extra_dims(own)
     for records in (las.vlrs, las.evlrs or []):  # COPC's say where its chunks are, which is nowhere the same
@@ -172,6 +172,7 @@ def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence
     if len(record) > LONGEST_RECORD:
         raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {LONGEST_RECORD}: ask for fewer")
     las.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
+    # All at once: laspy copies the points for each call.
     las.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])
     for name, values in attributes.items():
         las[name] = values

@@ -157,7 +157,7 @@ def lens_of(model: str, values: Terms) -> Lens | None:
     terms = tuple(float(values.get(name, 0.0)) for name in names)
     if not np.isfinite(terms).all():
         raise SceneError(f"lens distortion {', '.join(names)} is {terms}; expected finite numbers")
-    if model in ("perspective", "fov", "division") and not any(terms):
+    if model in ("perspective", "fov", "division") and not any(terms):  # with zeros these are pinholes
         return None
     lens = Lens(model, terms)
     if not widest(lens) > 0:

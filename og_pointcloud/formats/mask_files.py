@@ -68,7 +68,7 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
 def require_all(files: Sequence[Path], cure: str) -> None:
     """Raise one SceneError for all mask files that are missing: how many, the first three, and the cure."""
     missing = [file for file in files if not file.is_file()]
-    if missing:
+    if missing:  # one error for all: a capture may lack hundreds
         folder = missing[0].parents[0]
         names = ", ".join(file.name for file in missing[:3]) + (", ..." if len(missing) > 3 else "")
         raise SceneError(
@@ -91,7 +91,7 @@ def _id_header(file: Path) -> PngHeader:
 
 def read_ids(file: Path) -> NDArray[np.int32]:
     """A mask image, (H, W) int32: -1 outside every mask, else the row of the features (the stored id less 1)."""
-    has_palette = _id_header(file).color_type == PALETTE
+    has_palette = _id_header(file).color_type == PALETTE  # OpenCV would give colors instead of ids
     ids = palette_indices(file) if has_palette else decoded(file, require_cv2().IMREAD_UNCHANGED)
     if ids.ndim != 2:
         raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")

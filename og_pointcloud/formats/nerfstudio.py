@@ -59,7 +59,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         path = path.replace("\\", "/")
         with naming(f"{file}, frame '{path:.80}'"):
             camera_to_world = _matrix(frame, "transform_matrix")
-            if np.isfinite(camera_to_world).all():
+            if np.isfinite(camera_to_world).all():  # trackers write NaN where they were lost
                 keys = {**shared, **frame}
                 camera = _camera(keys, inverse(camera_to_world * OPENGL), partial(image_size, path))
                 lens = _lens(keys)

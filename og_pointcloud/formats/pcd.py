@@ -69,7 +69,7 @@ def _parse_header(head: bytes) -> _Header:
     # The header is a line a keyword, in any order, up to DATA.
     entries: dict[str, list[str]] = {}
     for line in head[: last_line.start()].decode("utf-8", "replace").split("\n"):
-        keyword, *values = line.split() or ["#"]
+        keyword, *values = line.split() or ["#"]  # blank lines count as comments
         if keyword.startswith("#"):
             continue
         if keyword in entries:

@@ -99,7 +99,7 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
             continue
         width, height, fx, fy, cx, cy = named_numbers(read_numbers(lens, 6).ravel(), range(6), lens)
         sensor = _sensor(width, height, fx, fy, cx + 0.5, cy + 0.5)
-        pose = inverse(rigid(rotation_of_vector(nearest[1:4]), nearest[4:7]))
+        pose = inverse(rigid(rotation_of_vector(nearest[1:4]), nearest[4:7]))  # stored world to camera
         yield RecordedFrame(path, lens, pose, sensor, (sensor, folder / "lowres_depth" / file.name))
 
 

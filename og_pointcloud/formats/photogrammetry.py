@@ -84,6 +84,7 @@ def _metashape(text: str, _: ImageSize) -> PosedFrames:
     except ElementTree.ParseError as error:
         raise SceneError(f"not valid XML ({error}): export the cameras again") from None
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled") != "false" and _cameras(chunk)]
+    # A chunk without a transform has a world of its own, which only the one chunk of a file may have.
     placed = [
         chunk for chunk in chunks if _world_of(chunk) is not None or chunk.find(".//component/transform") is not None
     ]
@@ -114,6 +115,7 @@ def _chunk(chunk: ElementTree.Element) -> tuple[list[PosedImage], list[str]]:
             dropped.append(label)
             continue
         with naming(f"camera '{label:.60}'"):
+            # Cameras that were aligned in several groups lie in components, each with a place of its own in the world.
             world = worlds.get(camera.get("component_id")) or world_of_chunk or (1.0, np.eye(3), np.zeros(3))
             images.append(_metashape_image(label, sensor, _floats(transform, 16).reshape(4, 4), world))
     return images, dropped

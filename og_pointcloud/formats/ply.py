@@ -152,7 +152,7 @@ def _parse_header(head: bytes) -> _Header:
 
 def _add_property(element: _Element, words: list[str], number: int) -> None:
     """Append the property that ``words``, the rest of a header line, declare."""
-    if words[0] == "list" and len(words) == 4:
+    if words[0] == "list" and len(words) == 4:  # its rows have unequal lengths, and are not read
         element.has_lists = True
         return
     if len(words) != 2:
@@ -173,6 +173,7 @@ def _rows(file: BinaryIO, element: _Element, byte_order: str) -> NDArray[np.void
     if not byte_order:
         return read_text_rows(file, element.dtype("="), element.count, what)
     rows = read_binary_rows(file, element.dtype(byte_order), element.count, what)
+    # To the machine's byte order, in which everything after this computes.
     return rows.astype(rows.dtype.newbyteorder("="), copy=False)
 
 

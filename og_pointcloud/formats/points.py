@@ -38,7 +38,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
     path = Path(path)
     with naming(path):
         with path.open("rb") as file:
-            head = file.read(4096)
+            head = file.read(4096)  # PCD headers may begin with comments
         if head.startswith((b"ply\n", b"ply\r", b"ply ")):
             elements = read_ply(path)
             if holds_gaussians(elements):

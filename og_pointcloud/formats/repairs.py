@@ -142,6 +142,7 @@ def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> li
 def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
     """The images as the pose file means them. Depth images move and scale with their photographs."""
     cameras = repaired_cameras([image.camera for image in images], repairs)
+    # All images have an entry, so that repairs of all cameras together shift depth images as they shift photographs.
     depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
     without_lens = {"lens": None} if any(repair.name == "lens" for repair in repairs) else {}
     repaired = []
@@ -212,7 +213,7 @@ def _aligned(cameras: list[Camera], repair: Repair) -> list[Camera]:
     for camera in cameras:
         rotation = camera.world_to_camera[:3, :3] @ turn.T
         center = mean + size * turn @ (camera.center - mean) + move
-        aligned.append(replace(camera, world_to_camera=rigid(rotation, -rotation @ center)))
+        aligned.append(replace(camera, world_to_camera=rigid(rotation, -rotation @ center)))  # t = -W c
     return aligned
 
 

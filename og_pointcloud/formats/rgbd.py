@@ -89,6 +89,7 @@ def _scannet(folder: Path) -> Iterator[RecordedFrame]:
     images = numbered_images(folder / "color")
     if not images:
         raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the color frames")
+    # One lens each for all frames; depth images have a size of their own.
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
@@ -158,7 +159,7 @@ def _replica(folder: Path) -> Iterator[RecordedFrame]:
             "image and a pose for each: copy both from one run"
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
-    lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
+    lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)  # meters a stored step
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
         source = f"{folder / 'traj.txt'}, line {line}"

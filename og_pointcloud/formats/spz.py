@@ -113,6 +113,7 @@ def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed
         )
     if count == 0:
         raise SceneError("it has 0 splats; expected at least one")
+    # Positions, opacity, color, scale, rotation, harmonics.
     sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * HARMONICS[degree] * count]
     if sum(sizes) > max(PLENTY, MOST_RATIO * packed):
         raise SceneError(
@@ -150,11 +151,12 @@ def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
     start, columns = table + 16 * streams, []
     if streams < 5 or start > len(data):
         raise SceneError(f"its table of {streams} columns at byte {table} does not fit: copy or export it again")
-    for number, size in enumerate(sizes[:5]):
+    for number, size in enumerate(sizes[:5]):  # harmonics, the sixth, stay packed
         packed, claimed = struct.unpack_from("<QQ", data, table + 16 * number)
         frame = data[start : start + packed]
         start += packed
         try:
+            # Before it is unpacked: whatever size is stated must be the one that follows from the header.
             if claimed != size or len(frame) < packed or zstandard.frame_content_size(frame) not in (size, -1):
                 raise SceneError(f"column {number} claims {claimed} bytes in {packed}; expected {size}: copy it again")
             column = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(frame, max_output_size=size)

@@ -86,6 +86,7 @@ def find_poses(
         _require_enough(model, files)
         placed = _put_back_names(model, files)
         _turn_upright(model)
+        # Nothing is in the capture before all is done.
         with replacing_folder(target / MODEL_FOLDER) as folder:
             (folder / "0").mkdir(parents=True)
             model.write_binary(str(folder / "0"))

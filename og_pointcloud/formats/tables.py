@@ -57,7 +57,7 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
     Takes no line beyond its last row. SceneError where a value does not fit its type, or rows are missing.
     """
     rows_text = islice((line for line in lines if not line.isspace()), count)
-    rows, first = np.empty(0, dtype), next(rows_text, None)
+    rows, first = np.empty(0, dtype), next(rows_text, None)  # numpy warns of input without a line
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 would store 300 as a byte, as 44
@@ -115,6 +115,7 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     """
     packed = _first_present(rows, tuple((name,) for name in PACKED_COLOR_COLUMNS))
     if packed and rows.dtype[packed[0]].itemsize == 4:
+        # The bytes as they are: taken as numbers, float colors would be tiny or NaN.
         bits = rows[packed[0]].view(np.uint32)
         return np.stack([(bits >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
     names = _first_present(rows, COLOR_COLUMNS)

@@ -137,7 +137,7 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
         raise SceneError(
             f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers ({camera.height}, {camera.width})"
         )
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf: not measured
         depth = depth.astype(np.float32)
     if frame.cloud is not None:
         with naming(name):

@@ -46,6 +46,7 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
             state = "moved" if track.moved else "present" if looked_at else "unseen"
         else:
             continue
+        # Half of its points have come by the median of the frames that brought them.
         since = known.stamp_of(int(np.median(known.kept.born[rows]))) if len(rows) else np.inf
         objects.append(
             MapObject(id_, state, place, size, len(rows), track.views, since, track.last_seen, track.descriptor)

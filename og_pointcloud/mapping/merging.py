@@ -30,7 +30,7 @@ from og_pointcloud.settings import FitSettings
 SAME_PLACE = 1.0
 """Spacings within which a point of the visit adds nothing to the map."""
 MOST_CAMERAS = 2000
-"""Cameras that a map remembers; older ones are thinned evenly."""
+"""Cameras that a map remembers, the latest ones."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,7 @@ def joined(
     def total(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.float64]:
         return np.asarray(np.bincount(owner, np.concatenate([one, other]), count), np.float64)
 
+    # Coarse clusters and wholes of b have numbers of its own visit: its new instances go without.
     masks, none = total(a.masks, b.masks), np.full(count - len(a), -1, np.int32)
     rows, owners = _descriptors(a, b, ids_of_b, count)
     return InstanceTable(

@@ -74,6 +74,7 @@ def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskE
 def _open_model(name: str | os.PathLike[str]) -> ImageModel:
     if name == "demo":
         return OnnxModel(DEMO_FOLDER / "image")
+    # A folder by its path, then by the feature space that it says it is of, then what other tools have fetched.
     path = Path(name).expanduser()
     if path.exists():
         return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path)

@@ -109,6 +109,7 @@ class ExistingMasks:
 
     def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
+        # Files of the image's own come before files of all images.
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
             return _resized(from_ids(read_ids(png), none=-1, tracks=self.tracks), shape)
@@ -245,6 +246,7 @@ def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
     if proposals is None or not len(proposals):
         return Proposals(np.zeros((0, *shape), np.bool_), np.zeros(0, np.float32))
     height, width = proposals.masks.shape[1:]
+    # The pixel that holds the middle of each pixel of the new size.
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
     masks = proposals.masks[:, rows.astype(np.int64)[:, None], columns.astype(np.int64)]

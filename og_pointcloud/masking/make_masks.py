@@ -151,6 +151,7 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
         if wrong:
             broken.append(wrong)
             warnings.warn(wrong, stacklevel=4)
+        # Wrong masks are seen after the first images, not after a night.
         done = [] if previewed else [task for task in tasks if task.work_file.exists()]
         if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
             shown = [(task.photograph.read(settings.longest_side), task.work_file) for task in done[:PREVIEW_IMAGES]]

@@ -239,6 +239,7 @@ def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
     a, b, area = borders.a, borders.b, regions[:, 0]
     mean, mean_squared = regions[:, 1:4] / area[:, None], regions[:, 4:] / area[:, None]
     texture = np.sqrt(np.maximum(mean_squared - mean**2, 0).sum(axis=1))
+    # The mean of two differences, of all colors and of those along the border; texture and small size shrink it.
     color = np.linalg.norm(mean[a] - mean[b], axis=1)
     color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE * np.minimum(texture[a], texture[b]))
     share = np.minimum(area[a], area[b]) / pixels

@@ -77,6 +77,7 @@ class FollowedWords:
         seen = self._loaded.model(inference_session=self._session, frame=pixels, frame_idx=self._step)
         self._forget()
         self._step += 1
+        # Tracks that the tracker itself holds back in this image, or has given up.
         hidden = {*(seen.suppressed_obj_ids or ()), *(seen.removed_obj_ids or ())}
         tracks = [track for track in sorted(seen.obj_id_to_mask) if track not in hidden]
         masks = [torch.zeros((0, 1, 1)), *(seen.obj_id_to_mask[track].float().cpu() for track in tracks)]

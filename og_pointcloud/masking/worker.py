@@ -64,6 +64,7 @@ class ImageWorker:
         masks = ids == np.arange(ids.max(initial=-1) + 1)[:, None, None]
         space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
         features = self.encoder.embed(image, masks) if self.encoder else np.zeros((len(masks), 1))
+        # The numbers of unit vectors lose at most 0.05 % in 16 bits.
         made = {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
         return made if proposals.tracks is None else {**made, "tracks": proposals.tracks[chosen]}
 

@@ -134,6 +134,7 @@ def label_bag(
             }
             for old, stamp, data in with_bar(messages_of(reader), "messages", reader.message_count, progress):
                 bag.write(copies[old.topic, old.msgtype], stamp, data)
+                # Labels follow their cloud, at its time.
                 if old.topic in clouds and (labelled := _label(store, data, tree, frame, labeller, report)):
                     for new, message in zip(ours[old.topic], labelled[1:], strict=True):
                         bag.write(new, stamp, store.serialize_cdr(message, new.msgtype))
@@ -192,6 +193,7 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
 def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
     """The new bag's connection for a topic of the old one, with its type definition and QoS."""
     ext: Any = old.ext
+    # As the old bag defines it; a type that it only names is defined by rosbags, if that knows it.
     definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
     if not (old.msgdef.data and old.digest) and old.msgtype in store.types:
         definition = {"typestore": store}

@@ -114,5 +114,5 @@ class FrameAssembler:
 def _camera(info: Any, world_to_camera: NDArray[np.float64]) -> Camera:
     if np.any(np.abs(np.asarray(info.d, np.float64)) > 1e-9):
         raise SceneError("camera_info has distortion; expected rectified images: record image_rect topics")
-    k = np.asarray(info.k, np.float64)
+    k = np.asarray(info.k, np.float64)  # 3 x 3, row by row: fx 0 cx, 0 fy cy, 0 0 1
     return Camera(int(info.width), int(info.height), k[0], k[4], k[2], k[5], world_to_camera)

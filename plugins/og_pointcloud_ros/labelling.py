@@ -39,7 +39,7 @@ class CloudLabeller:
     ) -> None:
         self.segmenter = segmenter
         self._messages, self._frame, self._minimum_points = messages, frame, minimum_points
-        self._instances = instance_table(segmenter.scene, up=UP)
+        self._instances = instance_table(segmenter.scene, up=UP)  # keeps the boxes
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.

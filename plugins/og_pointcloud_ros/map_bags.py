@@ -51,6 +51,7 @@ class BagFrames:
                 yield from self._made(stamp, assembler, tree)
 
     def _made(self, stamp: int, assembler: FrameAssembler, tree: TransformTree) -> Iterator[Frame]:
+        """The frame of a stamp, or none where it shows nothing or is dropped; the stamp is let go in any case."""
         try:
             if (frame := assembler.frame(stamp, partial(tree.lookup, self.frame))) is not None:
                 yield frame

@@ -67,7 +67,7 @@ class MapNode(PlacedNode):
 
     def _work(self) -> None:
         """Hand on the frames that are whole, or have waited long enough for the rest."""
-        now = time.monotonic()
+        now = time.monotonic()  # waiting counts from arrival: stamps may be of a bag or a simulation
         self._arrived = {stamp: self._arrived.get(stamp, now) for stamp in self._assembler.waiting}
         for stamp, arrived in self._arrived.items():
             is_old = now - arrived > self._max_age

@@ -77,6 +77,7 @@ def read_fields(message: Any) -> NDArray[Any]:
         return np.zeros((height, width), kind)
     if point_step == 0:
         raise SceneError(f"a PointCloud2 has {height * width} points of 0 bytes; expected x, y and z in each")
+    # Strides skip the padding behind points and rows.
     return np.ndarray((height, width), kind, data, strides=(row_step if height > 1 else data.size, point_step))
 
 
@@ -126,6 +127,7 @@ def write_fields(
     known = all(kind.base.newbyteorder("=") in DATATYPES for kind, _ in columns.values())
     if not columns or len(orders) > 1 or not known:
         raise SceneError(f"a PointCloud2 cannot hold {rows.dtype}; expected fields of 8 to 32-bit integers and floats")
+    # A structured array's type says what PointFields say: names, offsets, types, counts.
     height, width = rows.shape
     fields = [
         messages("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=count)

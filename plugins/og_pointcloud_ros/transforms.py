@@ -122,6 +122,7 @@ class TransformTree:
         return matrix
 
     def _pose(self, frame: str, stamp: int) -> NDArray[np.float64]:
+        """(4, 4) from a frame to its parent at that moment; TransformError outside of what is known."""
         edge = self._edges[frame]
         if edge.static:
             return pose_of(*edge.poses[-1])
@@ -133,7 +134,7 @@ class TransformTree:
             raise TransformError(
                 f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f}, not at {asked:.3f} s"
             )
-        before = after - 1
+        before = after - 1  # between two stamps: so far from one to the other
         share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])
         (place, turn), (next_place, next_turn) = edge.poses[before], edge.poses[after]
         return pose_of(place + share * (next_place - place), slerp(turn, next_turn, share))
