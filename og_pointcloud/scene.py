@@ -86,7 +86,7 @@ class Camera:
         pose = np.asarray(self.world_to_camera)
         if pose.shape != (4, 4) or pose.dtype.kind not in "fiu" or not np.isfinite(pose).all():
             raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
-        pose = pose.astype(np.float64)
+        pose = pose.astype(np.float64, copy=False)
         object.__setattr__(self, "world_to_camera", pose)
         numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
         if not all(isinstance(number, Real) for number in numbers):
