@@ -104,10 +104,14 @@ class MembershipSettings(_Checked):
     less openly it is seen."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
+    possible_openly: float = 0.2
+    """And from this share on where each vote counts by itself once more, so that views that see it openly decide."""
     growth_votes: float = 0.25
     """Such a point becomes one of the instance's when this share of the adjoining points are so already."""
     rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
+    missed_chance: float = 0.02
+    """What one view alone has a mask of is noise where the others miss as much with a smaller chance than this."""
     island_share: float = 0.15
     """A separate piece whose points show less than this share of what the main piece's do was seen through the main
     piece, and is not part of it."""

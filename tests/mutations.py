@@ -127,6 +127,18 @@ MUTATIONS = (
         "(rate < settings.rate_share * typical)", "(rate < 0 * typical)", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
+        "what one view alone has a mask of is a thing", "fitting/membership.py",
+        "(chance < settings.missed_chance)", "(chance < 0)", ("test_membership.py",),
+    ),
+    Mutation(
+        "whatever other views mask, one view is alone", "fitting/membership.py",
+        "(views == 1) & (of_group(masked - support.votes) < 0.5 * points)", "views == 1", ("test_membership.py",),
+    ),
+    Mutation(
+        "what slips past an edge is grown over", "fitting/membership.py",
+        "(support.share_openly > settings.possible_openly)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
+    ),
+    Mutation(
         "certainty without the neighbours", "fitting/membership.py",
         "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
     ),

@@ -20,6 +20,7 @@ from og_pointcloud.fitting.membership import (
     _best_group,
     _by_point,
     _object,
+    _share_openly,
     _without_islands,
     assign_points,
     instance_area,
@@ -346,6 +347,56 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-9)
     assert (best == -1).any()
     assert smaller.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_share_of_open_views_is_that_of_the_literal_reference(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    table, numbers = random_case(random)
+    group, best = np.array(numbers, np.int32), random.integers(-1, 5, 200).astype(np.int32)
+    votes, has_mask = view_votes(table), random.uniform(size=(5, 6)) < 0.5
+    share = _share_openly(_by_point(votes.in_mask), _by_point(votes.vote), group, table.mask_view, has_mask, best)
+    in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
+    for point, k in enumerate(best):
+        mine = np.flatnonzero(group == k) if k >= 0 else []
+        said = sum(in_mask[mask, point] * vote[table.mask_view[mask], point] for mask in mine)
+        asked = (vote[has_mask[k], point] ** 2).sum() if k >= 0 else 0
+        np.testing.assert_allclose(share[point], said / asked if asked else 0, rtol=1e-5)
+
+
+def test_what_slips_past_an_edge_is_not_grown_over() -> None:
+    """Beside the object, four of five views see points less openly, past its edge; one sees them openly, outside. Where
+    all see them alike, as on a rim of torn masks, they are the object's."""
+    edge, table = range(50, 54), hand_table(N, [[(range(54), ONE)]] * 4 + [[(OBJECT, ONE)]] * 5)
+    shown = np.ones((9, N), np.float32)
+    assert decide(table, [0] * 9).instance_ids.tolist() == [0] * 54 + [BACKGROUND] * 46
+    shown[:4, edge] = 0.7
+    past = replace(table, exposure=csr_array(shown))
+    assert decide(past, [0] * 9).instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_the_word_of_one_view_alone_is_noise_where_the_others_would_hardly_all_miss_a_thing() -> None:
+    """All views find the object; one finds something where no other has any mask."""
+    seen, blob = (OBJECT, ONE), (range(70, 90), ONE)
+    views: list[HandView] = [[seen, blob], *[[seen]] * 5]
+    assert ids_of(views, [0, 1, *[0] * 5]) == [0] * 50 + [BACKGROUND] * 50
+    # Two views may well have missed a thing; so may five that miss the object as often.
+    assert set(ids_of(views[:3], [0, 1, 0, 0])[70:90]) == {1}
+    assert set(ids_of([views[0], *[[]] * 5], [0, 1])[70:90]) == {1}
+
+
+def test_what_two_views_of_twenty_have_a_mask_of_is_noise_where_the_scene_misses_little() -> None:
+    seen, blob = (OBJECT, ONE), (range(70, 90), ONE)
+    views: list[HandView] = [*[[seen, blob]] * 2, *[[seen]] * 18]
+    assert ids_of(views, [0, 1, 0, 1, *[0] * 18]) == [0] * 50 + [BACKGROUND] * 50
+    assert set(ids_of(views[:10], [0, 1, 0, 1, *[0] * 8])[70:90]) == {1}
+
+
+def test_what_another_view_has_a_mask_of_too_is_no_word_of_one_view() -> None:
+    """The blob of one view lies in a mask of another too, which was left out for showing several things."""
+    seen: HandView = [(range(25), ONE), (range(25, 50), ONE)]
+    views: list[HandView] = [[*seen, (range(70, 90), ONE)]] * 2 + [seen] * 4
+    assert set(ids_of(views, [0, 1, 2, 0, 1, -1, *[0, 1] * 4])[70:90]) == {2}
 
 
 def test_a_small_thing_that_half_of_the_views_let_a_large_one_swallow_keeps_its_points() -> None:

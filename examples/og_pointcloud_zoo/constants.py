@@ -62,8 +62,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
-        "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
-        "membership.crossing", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
+        "membership.possible_openly", "membership.growth_votes", "membership.rate_share", "membership.missed_chance",
+        "membership.island_share", "membership.own_vote", "membership.crossing", "membership.gap_sizes",
+        "membership.front_share", "membership.hole_sizes",
         "fitting.colors.MOST", "fitting.colors.SURENESS_POWER", "fitting.view_votes.OPENNESS_POWER",
         "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN",
         "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",

@@ -109,8 +109,8 @@ def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> t
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
     By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not, and what
-    neighbours mend is the same for all sizes.
+    neighbours mend is the same for all sizes. Nor does it doubt what few views show: half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
-    by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf)
+    by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0)
     return assign_points(table, view_votes(table), groups, around, by_votes).instance_ids, groups.count

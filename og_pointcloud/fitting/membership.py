@@ -13,6 +13,13 @@ shares on the rim of the object itself. The two are told apart by place and colo
 the point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges), and in the end every
 point hears those about it, twice, each as far as it is sure and their colors speak for one thing (colors.py).
 
+What rays slip past is also told from a rim by who sees it well: it is in masks of views that see it badly and outside
+those of views that see it openly, where of a rim all say alike. So a middling share counts only where it stays one when
+each vote counts by itself once more.
+
+What one view alone has a mask of, and the others show outside all masks, is a thing only if as many views may well have
+missed one: how often they do, the scene's other groups tell.
+
 Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
 
@@ -87,10 +94,11 @@ def assign_points(
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
     of_points = _of_points(votes)
-    support = _support(of_points, groups.group, has_mask, np.ones(groups.count, np.bool_), settings.sure_share)
-    rate, dismissed = _contradicted(support, groups.count, settings)
+    of_masks = groups.group, table.mask_view, has_mask
+    support = _support(of_points, *of_masks, np.ones(groups.count, np.bool_), settings.sure_share)
+    rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     if dismissed.any():
-        support = _support(of_points, groups.group, has_mask, ~dismissed, settings.sure_share)
+        support = _support(of_points, *of_masks, ~dismissed, settings.sure_share)
     del of_points
     group, share, total = support.group, support.share, support.total
 
@@ -102,7 +110,7 @@ def assign_points(
     hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
     weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
-    possible = (group >= 0) & (share > settings.possible_share)
+    possible = (group >= 0) & (share > settings.possible_share) & (support.share_openly > settings.possible_openly)
     ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
     # Of what is known by hearsay alone, neighbours that are known better are asked; it is believed against so many of
     # them as the point is seen openly.
@@ -280,12 +288,15 @@ def _scale(indptr, columns, values, factor):  # noqa: ANN001, ANN202
 class _Support:
     """What speaks for the group that a point is of, if it is of any. group: (n,) int32, -1 where there is none.
     votes: (n,) float64, votes for it. possible: (n,) all votes of views that have a mask of it. total: (n,) all votes.
+    share_openly: (n,) the part of the possible votes that it has where each counts by itself once more: of two views
+    that differ, the one that sees the point more openly knows better.
     """
 
     group: NDArray[np.int32]
     votes: NDArray[np.float64]
     possible: NDArray[np.float64]
     total: NDArray[np.float64]
+    share_openly: NDArray[np.float64]
 
     @property
     def share(self) -> NDArray[np.float64]:
@@ -310,16 +321,21 @@ def _of_points(votes: ViewVotes) -> Sequence[Callable[[], tuple[_ByPoint, _ByPoi
 def _support(
     of_points: Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]],
     group: NDArray[np.int32],
+    mask_view: NDArray[np.int32],
     has_mask: NDArray[np.bool_],
     allowed: NDArray[np.bool_],
     sure_share: float,
 ) -> _Support:
     """The support of all points. of_points: as `_of_points` answers.
 
-    group: (masks,) the group of each mask, groups by what they show, largest first. has_mask: (groups, views).
-    allowed: (groups,) those that may be chosen.
+    group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
+    each. has_mask: (groups, views). allowed: (groups,) those that may be chosen.
     """
-    found = [_best_group(*some(), group, has_mask, allowed, sure_share) for some in of_points]
+    found = []
+    for some in of_points:
+        masks, views = some()
+        best, *of_best = _best_group(masks, views, group, has_mask, allowed, sure_share)
+        found.append((best, *of_best, _share_openly(masks, views, group, mask_view, has_mask, best)))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
@@ -399,24 +415,56 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
     return best, votes, possible, total
 
 
+@njit(cache=True, parallel=True)
+def _share_openly(masks, views, group, mask_view, has_mask, best):  # noqa: ANN001, ANN202
+    """(n,) `_Support.share_openly` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
+    mask_start, mask_index, mask_vote = masks
+    view_start, view_index, view_vote = views
+    share = np.zeros(len(best))
+    for g in prange(len(best)):
+        if best[g] < 0:
+            continue
+        e, of_group, asked = mask_start[g], 0.0, 0.0
+        for view in range(view_start[g], view_start[g + 1]):
+            while e < mask_start[g + 1] and mask_view[mask_index[e]] <= view_index[view]:
+                if group[mask_index[e]] == best[g]:
+                    of_group += mask_vote[e] * view_vote[view]
+                e += 1
+            if has_mask[best[g], view_index[view]]:
+                asked += view_vote[view] ** 2
+        share[g] = of_group / asked if asked > 0 else 0.0
+    return share
+
+
 def _contradicted(
-    support: _Support, count: int, settings: MembershipSettings
+    support: _Support, votes: ViewVotes, views: NDArray[np.integer], settings: MembershipSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Detection rate per group, and the groups whose rate is far below what the proposer reaches in this scene.
+    """Detection rate per group, and the groups that are noise of the proposer. views: (groups,) how many have a mask of
+    each.
 
     How often the proposer misses is a property of the scene's masks: a detector may find a chair in a third of the
     views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight.
+    Noise too is what a single view has a mask of and no other shows in any, where the chance that all of these missed a
+    thing is small. That chance is of all groups, and of one more that was never found: few tell no rate exactly.
     """
-    sure = (support.group >= 0) & (support.share > 0.5)
+    count, sure = len(views), (support.group >= 0) & (support.share > 0.5)
     group = support.group[sure]
-    visible = np.bincount(group, support.total[sure], count)
-    rate = np.bincount(group, support.possible[sure], count) / np.maximum(visible, 1e-12)
-    mass = np.bincount(group, support.votes[sure], count)
+
+    def of_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.bincount(group, values[sure], count).astype(np.float64, copy=False)
+
+    visible, mass = of_group(support.total), of_group(support.votes)
+    rate = of_group(support.possible) / np.maximum(visible, 1e-12)
     if mass.sum() == 0:
         return rate, np.ones(count, bool)
+    masked = np.asarray(votes.in_mask.sum(axis=0), np.float64).ravel()  # votes for any mask
     order = np.argsort(rate, kind="stable")
     typical = rate[order[np.searchsorted(np.cumsum(mass[order]), 0.5 * mass.sum())]]
-    return rate, (rate < settings.rate_share * typical) | (mass == 0)
+    points = np.maximum(np.bincount(group, minlength=count), 1)
+    alone = (views == 1) & (of_group(masked - support.votes) < 0.5 * points)
+    found = np.average(rate, weights=mass) * count / (count + 1)
+    chance = (1 - found) ** (of_group(support.total - masked) / points)
+    return rate, (rate < settings.rate_share * typical) | (mass == 0) | (alone & (chance < settings.missed_chance))
 
 
 @njit(cache=True)

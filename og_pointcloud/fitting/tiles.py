@@ -395,7 +395,7 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     table = shown.table(cloud, cloud.members[tile])
     around = cloud.neighbours(tile, settings.geometry)
     # Which groups are noise was decided for all tiles.
-    membership = replace(settings.membership, rate_share=0.0)
+    membership = replace(settings.membership, rate_share=0.0, missed_chance=0.0)
     votes, looks = view_votes(table), grouped.looks
     rgb = cloud.points.rgb
     rgb = None if rgb is None else rgb[cloud.members[tile]]

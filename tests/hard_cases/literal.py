@@ -59,11 +59,13 @@ def membership(
     rgb: (n, 3)."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
+    views_of: dict[int, list[int]] = {}
     for k in range(count):
         masks = [mask for mask in range(len(group)) if group[mask] == k]
         own[k] = votes.inside[masks].sum(axis=0)
-        asked[k] = votes.weight[sorted({mask_view[mask] for mask in masks})].sum(axis=0)
-    total = votes.weight.sum(axis=0)
+        views_of[k] = sorted({mask_view[mask] for mask in masks})
+        asked[k] = votes.weight[views_of[k]].sum(axis=0)
+    total, masked = votes.weight.sum(axis=0), votes.inside.sum(axis=0)
 
     def best_of(allowed: Sequence[int]) -> tuple[Ids, Array]:
         best, share = np.full(len(points), -1, np.int32), np.zeros(len(points))
@@ -85,7 +87,20 @@ def membership(
     ascending = sorted(range(count), key=lambda k: rates[k])
     half = [k for i, k in enumerate(ascending) if sum(masses[a] for a in ascending[: i + 1]) >= sum(masses) / 2]
     kept = [k for k in range(count) if masses[k] > 0 and rates[k] >= settings.rate_share * rates[half[0]]]
+    found = sum(masses[k] * rates[k] for k in range(count)) / sum(masses) * count / (count + 1)
+    for k in list(kept):  # the word of one view alone, where others would hardly all have missed a thing
+        by_others = np.mean(masked[sure[k]] - own[k, sure[k]])
+        missed = np.mean(total[sure[k]] - masked[sure[k]])
+        if len(views_of[k]) == 1 and by_others < 0.5 and (1 - found) ** missed < settings.missed_chance:
+            kept.remove(k)
     best, share = best_of(kept)
+    openly = np.zeros(len(points))  # the share where each vote counts by itself once more
+    for g in np.flatnonzero(best >= 0):
+        k = int(best[g])
+        inside = sum(
+            votes.inside[mask, g] * votes.weight[mask_view[mask], g] for mask in range(len(group)) if group[mask] == k
+        )
+        openly[g] = inside / sum(votes.weight[view, g] ** 2 for view in views_of[k])
 
     seen = sorted(votes.openness[votes.openness > 0])
     typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
@@ -101,7 +116,7 @@ def membership(
     if rgb is not None:
         apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
         alike = color_ratios(rgb, ids, sureness(), neighbours)[np.rint(apart).astype(int)]
-    possible = (best >= 0) & (share > settings.possible_share)
+    possible = (best >= 0) & (share > settings.possible_share) & (openly > settings.possible_openly)
     while True:  # a middling share counts where it adjoins points that are in already
         beside = [sum(alike[g, other] for other in neighbours[g] if ids[other] == best[g]) for g in points]
         needed = [settings.growth_votes * sum(alike[g, other] for other in neighbours[g]) for g in points]
