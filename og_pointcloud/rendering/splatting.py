@@ -17,6 +17,7 @@ more covered than not. It is a depth test with the accuracy of a surface, not of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ from og_pointcloud.scene import Camera, Points
 
 TILE = WIDTH
 """Pixels along a tile's side: 16 as in 3DGS, so that a row of a tile is one vector."""
+RUN = 64
+"""Gaussians, one after the other, that are passed over together where they all lie beside an image."""
 BATCH = 128
 """Splats of a tile that are fetched at once."""
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
@@ -80,6 +83,11 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @cached_property
+    def boxes(self) -> NDArray[np.float32]:
+        """(runs, 7) about each RUN of them: least x, y, z, greatest x, y, z of the centres, and the longest axis."""
+        return _boxes(self.xyz, self.scale)
 
     def take(self, rows: NDArray[np.integer] | None) -> Gaussians:
         """The Gaussians of these rows, in their order; None: all."""
@@ -187,7 +195,7 @@ def binned_splats(
     shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
-    rows = np.flatnonzero(_may_show(shapes[:2], seen_by, cutoffs))
+    rows = np.flatnonzero(_may_show(gaussians.xyz, gaussians.scale, gaussians.boxes, _borders(seen_by, cutoffs)))
     splats = _records(len(rows))
     order = ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
     # In order of depth in memory too: those of a tile are then read from front to back.
@@ -248,33 +256,61 @@ def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
     )
 
 
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _may_show(shapes, seen_by, cutoffs):  # noqa: ANN001, ANN202
-    """(n,) bool: not of splats before the near plane, and of those that a circle around their ellipse, larger than it,
-    puts beside the image: most of a cloud costs a few products a view, and no projection."""
-    (xyz, scale), (pose, intrinsics, size, near) = shapes, seen_by
-    fx, fy, cx, cy = intrinsics
-    low_x, low_y = linearised_at(-np.inf, -np.inf, intrinsics, size)
-    high_x, high_y = linearised_at(np.inf, np.inf, intrinsics, size)
+@njit(cache=True, nogil=True)
+def _boxes(xyz, scale):  # noqa: ANN001, ANN202
+    boxes = np.empty((-(-len(xyz) // RUN), 7), np.float32)
+    for run in range(len(boxes)):
+        boxes[run, :3], boxes[run, 3:6], boxes[run, 6] = np.inf, -np.inf, 0
+        for g in range(run * RUN, min((run + 1) * RUN, len(xyz))):
+            for axis in range(3):
+                boxes[run, axis] = min(boxes[run, axis], xyz[g, axis])
+                boxes[run, 3 + axis] = max(boxes[run, 3 + axis], xyz[g, axis])
+                boxes[run, 6] = max(boxes[run, 6], scale[g, axis])
+    return boxes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _borders(seen_by, cutoffs):  # noqa: ANN001, ANN202
+    """(5, 5): the near plane and the four borders of an image. Where ``a x + b y + c z + d + e * longest axis`` of a
+    row (a, b, c, d, e) is not above 0, a circle around the splat's ellipse, larger than it, lies beyond."""
+    pose, (fx, fy, cx, cy), size, near = seen_by
+    low_x, low_y = linearised_at(-np.inf, -np.inf, (fx, fy, cx, cy), size)
+    high_x, high_y = linearised_at(np.inf, np.inf, (fx, fy, cx, cy), size)
     # Standard deviations from the centre to where an opaque splat's alpha is the least; a tenth more for poses and
     # quaternions that are not quite of length one. Times depth, the radius is own * longest axis + blur * depth.
     reach = 1.1 * np.sqrt(-2 * np.log(cutoffs.alpha_min))
     own_x = reach * fx * np.sqrt(1 + max(abs(low_x), abs(high_x)) ** 2)
     own_y = reach * fy * np.sqrt(1 + max(abs(low_y), abs(high_y)) ** 2)
     blur = reach * np.sqrt(LOW_PASS) + 1
-    may = np.ones(len(xyz), np.bool_)
-    for g in prange(len(xyz)):
-        x, y, z = np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2])
-        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if not depth > near:
-            may[g] = False
-            continue
-        right = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
-        down = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
-        longest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2]))
-        radius_x, radius_y = own_x * longest + blur * depth, own_y * longest + blur * depth
-        beside = right < -radius_x or right > size[0] * depth + radius_x
-        may[g] = not (beside or down < -radius_y or down > size[1] * depth + radius_y)
+    borders = np.zeros((5, 5))
+    borders[0, :4] = pose[2]
+    borders[0, 3] -= 0.999999 * near  # for rounding: which depths are beyond it `_project` says
+    borders[1, :4], borders[1, 4] = fx * pose[0] + (cx + blur) * pose[2], own_x
+    borders[2, :4], borders[2, 4] = -fx * pose[0] + (size[0] - cx + blur) * pose[2], own_x
+    borders[3, :4], borders[3, 4] = fy * pose[1] + (cy + blur) * pose[2], own_y
+    borders[4, :4], borders[4, 4] = -fy * pose[1] + (size[1] - cy + blur) * pose[2], own_y
+    return borders
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _may_show(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
+    """(n,) bool: not of splats that lie beyond one of an image's borders: most of a cloud costs a product a run and a
+    border, and no projection."""
+    may = np.zeros(len(xyz), np.bool_)
+    for run in prange(len(boxes)):
+        within = True
+        for k in range(len(borders)):
+            a, b, c = borders[k, 0], borders[k, 1], borders[k, 2]
+            innermost = max(a * boxes[run, 0], a * boxes[run, 3]) + max(b * boxes[run, 1], b * boxes[run, 4])
+            innermost += max(c * boxes[run, 2], c * boxes[run, 5]) + borders[k, 3] + borders[k, 4] * boxes[run, 6]
+            within &= innermost > 0
+        for g in range(run * RUN, min((run + 1) * RUN, len(xyz)) if within else 0):
+            longest = max(scale[g, 0], scale[g, 1], scale[g, 2])
+            within = True
+            for k in range(len(borders)):
+                inside = borders[k, 0] * xyz[g, 0] + borders[k, 1] * xyz[g, 1] + borders[k, 2] * xyz[g, 2]
+                within &= inside + borders[k, 3] + borders[k, 4] * longest > 0
+            may[g] = within
     return may
 
 
