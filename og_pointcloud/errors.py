@@ -19,6 +19,16 @@ def printable(text: str, most: int | None = None) -> str:
     return shown if most is None or len(shown) <= most else f"{shown[: most - 3]}..."
 
 
+def coordinate(value: float) -> str:
+    """A coordinate to be read: a tenth of a unit at least, which four digits of a map's 4000123.4 would not be.
+
+    >>> from og_pointcloud.errors import coordinate
+    >>> coordinate(0.52314), coordinate(4000123.4321)
+    ('0.5231', '4000123.4')
+    """
+    return f"{value:.1f}" if 1e3 <= abs(value) < 1e15 else f"{value:.4g}"
+
+
 def first_line(error: BaseException) -> str:
     """First line of another library's error, at most 200 characters; its type's name where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

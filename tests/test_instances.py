@@ -148,6 +148,15 @@ def test_printed_table_is_cut_and_starts_with_the_largest():
     assert len(lines) == 15
 
 
+def test_places_on_a_map_are_told_to_a_tenth_of_a_meter():
+    cloud = make_cloud(np.random.default_rng(0).random((50, 3)), np.zeros(50, np.int32))
+    far = replace(cloud, origin=np.array([500_000.25, 4_000_000.5, 100.0]))
+    assert " 50000" in repr(og.instance_table(far))
+    assert " 400000" in repr(og.instance_table(far))
+    with pytest.raises(og.OgPointcloudError, match="a label is empty"):
+        og.segment(cloud, ["chair", " "], cloud)
+
+
 def test_any_way_to_name_a_scene(bundle):
     for source in (bundle, str(bundle), og.load(bundle), room(600)):
         assert len(og.instance_table(source)) == 9

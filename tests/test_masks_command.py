@@ -407,6 +407,8 @@ OWN = """
 import numpy as np
 def bright(image):
     return image.max(axis=2) / 255
+def broken(image):
+    return 1 / 0
 def halves(image):
     left = np.arange(image.shape[1]) < image.shape[1] // 2
     return np.broadcast_to([[left], [~left]], (2, *image.shape[:2])).copy()
@@ -422,6 +424,7 @@ number = 3
 def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own_masks.py").write_text(OWN)
+    (tmp_path / "typo.py").write_text("def x(:")
     make_capture(tmp_path / "c", 2)
     settings = MaskSettings(proposer="python:own_masks:halves", encoder=None)
     assert make_masks("c", settings, "halves", progress=False).masks == 4
@@ -433,6 +436,8 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
         "no_module:bright": "no proposer 'python:no_module:bright'",
         "own_masks": "expected python:MODULE:NAME",
         "own_masks:bright": "a mask proposer gave",
+        "own_masks:broken": r"python:own_masks:broken failed \(ZeroDivisionError: division by zero\)",
+        "typo:x": r"no proposer 'python:typo:x' \(SyntaxError",
     }.items():
         settings = MaskSettings(proposer=f"python:{place}", encoder=None)
         with pytest.raises(OgPointcloudError, match=says):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.errors import printable
+from og_pointcloud.errors import coordinate, printable
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.tables import csv_text
 
@@ -239,7 +239,7 @@ def _cells(row: Instance) -> tuple[str, ...]:
         f"{row.agreement:.2f}",
         "-" if row.reliability is None else f"{row.reliability:.2f}",
         row.state,
-        "-" if row.centroid is None else " ".join(f"{value:.4g}" for value in row.centroid),
+        "-" if row.centroid is None else " ".join(map(coordinate, row.centroid)),
         "-" if box is None else " x ".join(f"{value:.3g}" for value in box.size),
         ", ".join(f"{printable(name, 40)} {score:.2f}" for name, score in row.words) or "-",
     )

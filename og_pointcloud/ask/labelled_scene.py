@@ -27,7 +27,7 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, coordinate
 from og_pointcloud.scene import RIGID, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
@@ -420,4 +420,4 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
 
 def _box(points: NDArray[np.float64]) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
-    return " x ".join(f"{a:.6g}..{b:.6g}" for a, b in zip(low, high, strict=True))
+    return " x ".join(f"{coordinate(a)}..{coordinate(b)}" for a, b in zip(low, high, strict=True))

@@ -22,7 +22,7 @@ from og_pointcloud.cli.common import (
     print_next,
     print_table,
 )
-from og_pointcloud.errors import printable
+from og_pointcloud.errors import coordinate, printable
 
 if TYPE_CHECKING:
     from og_pointcloud.collection.collection import Finding
@@ -77,6 +77,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def cells(finding: Finding) -> tuple[str, ...]:
-    center = " ".join(f"{value:.4g}" for value in finding.center)
+    center = " ".join(map(coordinate, finding.center))
     size = " x ".join(f"{value:.3g}" for value in finding.size)
     return finding.scene, str(finding.instance), finding.word, f"{finding.score:.3f}", center, size

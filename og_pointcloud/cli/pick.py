@@ -13,7 +13,7 @@ from typing import Any
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import OgPointcloudError, did_you_mean
+from og_pointcloud.errors import OgPointcloudError, coordinate, did_you_mean
 
 
 def add(parser: Parser) -> None:
@@ -84,7 +84,7 @@ def print_pick(report: Mapping[str, Any]) -> None:
     """Print what was hit and where, the words that fit it best, and the mask's file."""
     print(report["what"])
     if report["xyz_world"]:
-        print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")
+        print(f"hit at {', '.join(map(coordinate, report['xyz_world']))} (point {report['point']})")
     if report["words"]:
         best = [f"{word['name']} {word['score']:.2f}" for word in report["words"]]
         print(f"best words: {common.some_of(best)}")

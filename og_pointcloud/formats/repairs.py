@@ -88,7 +88,8 @@ class Repair:
         numbers = _numbers(value)
         if kind is not None and numbers and len(numbers) == kind.numbers and (kind.may_be_negative or numbers[-1] > 0):
             return cls(name, value, numbers)
-        expected = kind and (", ".join(kind.words[:8]) or f"{kind.numbers} finite numbers")
+        above = "" if kind is None or kind.may_be_negative else ", the last above 0"
+        expected = kind and (", ".join(kind.words[:8]) or f"{kind.numbers} finite number(s){above}")
         raise SceneError(
             f"'{text:.80}' is no repair; expected name=value with a name of {', '.join(sorted(KINDS))}"
             f"{f'; {name} takes {expected}' if kind else ''} ('og-pointcloud repair --help' explains)"

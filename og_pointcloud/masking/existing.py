@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import SceneError, first_line
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
@@ -62,9 +62,15 @@ class CallableProposer:
     name: str = "callable"
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
-        """SceneError where the function gives something else."""
+        """SceneError where the function fails, or gives something else."""
         height, width = image.shape[:2]
-        return as_proposals(self.function(image), (height, width))
+        try:
+            given = self.function(image)
+        except Exception as error:
+            raise SceneError(
+                f"the mask proposer {self.name} failed ({_of_user(error)}): og-pointcloud --debug shows where"
+            ) from error
+        return as_proposals(given, (height, width))
 
 
 def own_proposer(place: str) -> MaskProposer:
@@ -81,9 +87,10 @@ def own_proposer(place: str) -> MaskProposer:
         file = Path(*module.split(".")).with_suffix(".py")
         # A file is run by its path, not imported: one called numpy.py does not take numpy's place.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, KeyError) as error:
+    except Exception as error:  # whatever running the module may raise
         raise SceneError(
-            f"no proposer 'python:{place}' ({error}); expected a name in {module}.py here, or in an installed module"
+            f"no proposer 'python:{place}' ({_of_user(error)}); expected a name in {module}.py here, or in an installed "
+            "module"
         ) from error
     made = found() if isinstance(found, type) else found
     if hasattr(made, "propose") and hasattr(made, "name"):
@@ -93,6 +100,10 @@ def own_proposer(place: str) -> MaskProposer:
     raise SceneError(
         f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose and name"
     )
+
+
+def _of_user(error: Exception) -> str:
+    return f"{type(error).__name__}: {first_line(error)}"
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud.ask.picking import front_points
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.collection.collection import Collection, Finding, Findings
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, coordinate
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.show.viewpoint import Viewpoint
 
@@ -64,7 +64,7 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
         shown = f'<img alt="instance {finding.instance}" src="data:image/png;base64,{png}">'
     except (OgPointcloudError, OSError):  # moved, or written anew: what was found then is still true of it then
         shown = '<div class="none">file not found</div>'
-    center, size = (", ".join(f"{value:.3g}" for value in values) for values in (finding.center, finding.size))
+    center, size = ", ".join(map(coordinate, finding.center)), ", ".join(f"{value:.3g}" for value in finding.size)
     return (
         f'<figure>{shown}<figcaption><span class="score">{finding.score:.3f}</span><b>{rank}. '
         f"{html.escape(finding.word)}</b><br>{html.escape(finding.scene)}, instance {finding.instance}<br>"

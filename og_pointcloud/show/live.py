@@ -17,7 +17,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, coordinate, printable
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
@@ -203,7 +203,7 @@ class LiveScene:
         lines = [f"instance {instance} · {row.points:,} points · {row.views} views"]
         if row.oriented_box is not None and row.centroid is not None:
             size = " x ".join(f"{length:.3g}" for length in row.oriented_box.size)
-            lines.append(f"size {size} · at {', '.join(f'{value:.4g}' for value in row.centroid)}")
+            lines.append(f"size {size} · at {', '.join(map(coordinate, row.centroid))}")
         if row.state == NO_FEATURE:
             note = "no mask gave it a feature: it answers every word with unknown"
         else:

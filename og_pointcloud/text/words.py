@@ -55,6 +55,8 @@ def resolve_labels(
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
+        if not word.strip():
+            raise OgPointcloudError("a label is empty; expected words: name what you want to find")
     return _checked(words, _looked_up(words, sources, feature_space, carried))
 
 
