@@ -89,8 +89,8 @@ def own_proposer(place: str) -> MaskProposer:
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
     except Exception as error:  # whatever running the module may raise
         raise SceneError(
-            f"no proposer 'python:{place}' ({_of_user(error)}); expected a name in {module}.py here, or in an installed "
-            "module"
+            f"no proposer 'python:{place}' ({_of_user(error)}); expected a name in {module}.py here, or in an "
+            "installed module"
         ) from error
     made = found() if isinstance(found, type) else found
     if hasattr(made, "propose") and hasattr(made, "name"):
