@@ -3,6 +3,8 @@
 import json
 import shlex
 import shutil
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -122,6 +124,18 @@ def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsy
     assert "no words are known yet" in stdout
     command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+
+
+def test_a_cut_image_is_one_line(tiny_capture):
+    """In a process of its own: OpenCV, which warns too, reads how loud it shall be when it is imported."""
+    mask = next(iter((tiny_capture.folder / "masks").iterdir()))
+    mask.write_bytes(mask.read_bytes()[:-40])
+    program = "import sys; from og_pointcloud.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "fit", tiny_capture.folder, "-o", tiny_capture.folder / "a.ogpc"]
+    found = subprocess.run(command, capture_output=True, text=True)
+    assert found.returncode == 2
+    assert found.stderr.startswith("error: ")
+    assert len(found.stderr.splitlines()) == 1, found.stderr
 
 
 def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys):

@@ -36,6 +36,7 @@ class PngHeader(NamedTuple):
 def require_cv2() -> ModuleType:
     """OpenCV, or an error that names the extra."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when it is imported
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warning of a damaged file stands beside our error
     with naming_extra("opencv-contrib-python-headless", "fit"):
         import cv2
     return cv2
