@@ -133,7 +133,7 @@ def _stored(file: Path) -> NDArray:
                 "bit: pictures of depth in colors or 8 bit have lost the lengths"
             )
         values = decoded(file, require_cv2().IMREAD_UNCHANGED)
-    if values.ndim == 3 and values.shape[-1] == 1:
+    if values.ndim == 3 and values.shape[-1] == 1:  # a channel axis of one
         values = values[..., 0]
     kind = values.dtype.kind
     if values.ndim != 2 or not (kind == "f" or (kind in "iu" and values.dtype.itemsize > 1)) or not values.size:

@@ -78,6 +78,7 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
             continue
         content = read_json_object(source)
         pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL
+        # 3 x 3, row by row.
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
         sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)  # it counts pixel centers at whole numbers
         yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth))

@@ -33,6 +33,7 @@ NUMPY_TYPES = {
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
 PLY_TYPES = {numpy_type: name for name, numpy_type in reversed(NUMPY_TYPES.items())}
+"""The names of 1994, which every reader knows: reversed, the first name of a type is the last one set."""
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 

@@ -141,7 +141,8 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
     normal, second = _normals(depth, lens_of(camera))
     second = second[np.isfinite(second)]
     # before - 2 here + after of readings with independent noise s has the variance (1 + 4 + 1) s^2; the median of its
-    # size times 1.4826 is its standard deviation, whatever edges of objects add to a few of them.
+    # size times 1.4826 is its standard deviation, whatever edges of objects add to a few of them. This is the noise
+    # along the axis: at right angles to a slanted surface there is less.
     noise = 1.4826 * float(np.median(second)) / np.sqrt(6.0) if len(second) else 0.0
     return MeasuredView(camera, depth, normal, noise)
 

@@ -108,6 +108,7 @@ def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessi
             f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
+    # What the folder does not state is as in the published models of its family.
     mean, std = CLIP_COLORS if is_clip else SIGLIP_COLORS
     mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
     return Preprocessing(size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number], keeps_shape=is_clip)

@@ -26,6 +26,7 @@ MAX_MASKS_PX = 1 << 33
 def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> Proposals:
     """An id map (H, W) as proposals of score 1, by ascending id. none: the id outside every mask. tracks: whether ids
     are those of tracks."""
+    # Ids may be any numbers, with gaps: only those that occur become masks.
     names = np.unique(ids)
     names = names[names != none]
     _check_room(len(names), ids.shape, "the id map")

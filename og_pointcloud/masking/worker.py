@@ -95,6 +95,7 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
                 f"{asked} are asked of proposer '{text}'{'' if words else ' without words'}; expected words with SAM 3 "
                 "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both, or with a folder of id PNGs"
             )
+        # Imported where it is asked for, as all proposers below: torch takes seconds, and not everybody has it.
         from og_pointcloud.masking.sam3 import FollowedWords, NamedThings
 
         return NamedThings(name, words) if followed is None else FollowedWords(name, words, followed)

@@ -146,6 +146,7 @@ class SegmentNode(PlacedNode):
         """Label the waiting cloud, if there is one and its transform has come."""
         if self._waiting is None:
             return
+        # Taken first, and put back only while its transform may still come: a cloud that fails is not tried again.
         message, arrived = self._waiting
         self._waiting = None
         try:
