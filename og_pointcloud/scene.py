@@ -112,6 +112,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with its image scaled to width x height pixels."""
         # (0, 0) is the image's corner, pixel centers lie at +0.5: the principal point scales as the focal length does.
+        if (width, height) == (self.width, self.height):
+            return self
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 

@@ -395,7 +395,8 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
 
 def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
     """Where the posed images are, None for one that is not found; warns of those."""
-    files = [find_image(capture, image.path) for image in images]
+    file_of = {path: find_image(capture, path) for path in {image.path for image in images}}  # faces share an image
+    files = [file_of[image.path] for image in images]
     missing = [image.path for image, file in zip(images, files, strict=True) if file is None]
     if missing:
         warnings.warn(

@@ -80,8 +80,10 @@ class Face:
         expected = (self.whole.height, self.whole.width)
         if values.shape != expected:
             raise SceneError(f"the map is {values.shape}; expected the camera's {expected} (rows, columns)")
-        # Pixels without a counterpart have the index -1, which takes the value appended here.
-        return np.append(values, values.dtype.type(otherwise)).take(_nearest(self._key), mode="wrap")
+        nearest = _nearest(self._key)
+        picked = values.take(nearest, mode="wrap")  # pixels without a counterpart, of index -1, are set below
+        picked[nearest < 0] = otherwise
+        return picked
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 of this view, by linear interpolation, black where the lens saw nothing. rgb: (h, w, 3), the
