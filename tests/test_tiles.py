@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from street import MadeStreet, make_street
 
 import og_pointcloud as og
+from og_pointcloud.checking.check import CaptureWarning
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
@@ -288,6 +289,31 @@ def test_bad_use_is_told_at_the_door():
         FitSettings(tile_points=0)
     with pytest.raises(OgPointcloudError, match="seed is -1"):
         FitSettings(seed=-1)
+
+
+def spot(side: int) -> Scene:
+    """A wall in the middle of three images, and in each one mask in their corner, so many pixels wide."""
+    x, y = np.meshgrid(np.linspace(-0.3, 0.3, 40), np.linspace(-0.3, 0.3, 40))
+    xyz = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
+    masks = np.full((64, 64), -1, np.int32)
+    masks[:side, :side] = 0
+    camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
+    views = tuple(View(name, camera, masks, np.eye(1, 2, dtype=np.float32)) for name in "abc")
+    return Scene(Points(xyz, np.zeros(3)), views, "two-words")
+
+
+def test_masks_that_show_no_point_are_refused_as_in_a_whole_fit():
+    for tile_points in (None, 500):
+        with pytest.raises(SceneError, match="none of the 3 masks shows a Gaussian"):
+            fit(spot(8), replace(SETTINGS, tile_points=tile_points), progress=False)
+
+
+def test_masks_that_the_sample_misses_give_no_instance(monkeypatch):
+    monkeypatch.setattr(tiles, "SAMPLE_STEP", POINTS)
+    few = replace(SETTINGS, tile_points=500, grouping=replace(SETTINGS.grouping, graph_points=3))
+    with pytest.warns(CaptureWarning, match="instances: none"):
+        cloud = fit(spot(23), few, progress=False)  # the mask shows a corner of the wall, and none of the sample
+    assert len(cloud.instances) == 0
 
 
 def test_a_fit_is_in_tiles_where_memory_is_short_and_they_help(monkeypatch):

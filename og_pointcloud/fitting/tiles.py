@@ -49,7 +49,7 @@ from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
 SAMPLE_STEP = 50
-"""Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
+"""Masks are grouped by at least one in so many points, even where that is more than a fit of the whole would sample."""
 FINEST_PX = 0.35
 """Points closer together than this in an image are thinned to it. On a street of 600,000 points 0.2 % of the labels
 then differ, 1.4 % at 0.5 and 17 % at 1, where a point no longer has a splat of its own in any image."""
@@ -58,8 +58,8 @@ MOST_SPLATS = 4_000_000
 CHOICE_POINTS = 1_000_000
 """Size and opacity of the splats are chosen on so many points, spread over the cloud."""
 LEAST_TILE, LARGEST_TILE = 125_000, 2_000_000
-"""Points of a tile where memory decides, in steps of twice as many: a fit that is taken up finds the same tiles.
-Smaller ones are mostly margin, larger ones save no time."""
+"""Points of a tile where memory decides, in steps of twice as many, so that an interrupted fit finds the same tiles
+although the free memory is never the same. Smaller tiles are mostly margin, larger ones save no time."""
 TILE_BYTES = 1_500
 """Bytes that a tile takes at its peak, per point."""
 FIT_BYTES = 1_000
@@ -77,8 +77,8 @@ M + 2: exposure through holes."""
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
-    """Whether a fit is asked to be in tiles, or all points at once would take more memory than it may and tiles would
-    help it."""
+    """Whether a fit in tiles is asked for, or all points at once would take more memory than allowed and tiles would
+    help."""
     if settings.tile_points is not None:
         return True
     points = len(scene.points)
@@ -125,6 +125,7 @@ def fit_tiles(
     with journal.stage("grouping"):
         grouped = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
+        # Points are decided without features: tasks that do not carry them are small.
         no_features = replace(shown, mask_features=np.zeros((len(shown.mask_view), 0), np.float32))
         decide = partial(_decide, cloud, no_features, grouped, settings)
         decided = run(decide, range(len(cloud.tiles)), "membership")
@@ -134,7 +135,8 @@ def fit_tiles(
 
 
 def _memory(points: int, settings: FitSettings, executor: Executor | None) -> int:
-    """Bytes that a fit may still take, here and in a worker, where the points are mapped, not held."""
+    """Bytes that a fit may still take, here and in a worker."""
+    # In a worker the points are mapped, not held: they do not count against its share.
     left = memory_left(settings.memory)
     if executor is None or (share := executor.submit(share_here, Share()).result().memory) is None:
         return left
@@ -142,6 +144,7 @@ def _memory(points: int, settings: FitSettings, executor: Executor | None) -> in
 
 
 def _points_per_tile(points: int, left: int) -> int:
+    """Points of a tile for a fit that may take ``left`` bytes: LEAST_TILE times a power of two."""
     fitting = (left - points * CLOUD_BYTES) // TILE_BYTES
     if fitting < LEAST_TILE:
         raise OgPointcloudError(
@@ -153,7 +156,7 @@ def _points_per_tile(points: int, left: int) -> int:
 
 
 def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
-    """Of a tile's points."""
+    """(points of the tile,) their spacing."""
     return cloud.neighbours(tile, settings.geometry).spacing[cloud.inner(tile)]
 
 
@@ -162,8 +165,8 @@ def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class _Drawing:
-    """How points are drawn, the same in every tile. scale, opacity: of a plain cloud's splats, in spacings; None for
-    Gaussians. near, typical: lengths."""
+    """How points are drawn, the same in every tile. scale, opacity: of a plain cloud's splats, scale in spacings; None
+    for Gaussians. near, typical: depth of the near plane and the cloud's typical spacing, scene units."""
 
     scale: float | None
     opacity: float | None
@@ -171,7 +174,7 @@ class _Drawing:
     typical: float
 
     def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
-        """Splats of some points, each so many times larger than it would be."""
+        """Splats of some points, each ``larger`` times as large as it would be."""
         chosen = cloud.points.take(rows)
         if self.scale is None or self.opacity is None:
             splats = Gaussians.from_points(chosen)
@@ -211,6 +214,7 @@ class _Shown:
 
     def table(self, cloud: TiledCloud, rows: NDArray[np.integer]) -> MaskTable:
         """The mask table of some points, given in ascending order: of photographs, not of the views cut from them."""
+        # place: the column of each point, -1 for others. Entries are read of those tiles alone that have such points.
         place = np.full(len(cloud.points), -1, np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         tiles = np.flatnonzero(np.diff(np.searchsorted(rows, cloud.tiles.start)))
@@ -236,14 +240,14 @@ def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, ...]
 
 
 def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
-    """What the views show, all of which are in the work folder."""
+    """What the views show, all in the work folder. SceneError where no view shows a point, or no mask does."""
     if found := sum(view.was_there for view in looked):
         folder = "" if cloud.work.folder is None else cloud.work.folder.name
         journal.leave_out(LeftOut.RENDERING, count=found, folder=folder)
     for view in looked:
         cloud.work.adopt("view", view.key)
     masks = [view.mask_features for view in scene.views if view.mask_count]
-    require_sight(sum(int(view.first[-1]) for view in looked), len(masks), scene)
+    require_sight(sum(int(view.first[-1]) for view in looked), sum(view.masked for view in looked), scene)
     drawn, inside = np.sum([view.drawn for view in looked], axis=0).tolist()
     if drawn < inside:
         share = 1 - drawn / inside
@@ -263,28 +267,31 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
 
 @dataclass(frozen=True)
 class _LookedAt:
-    """A view in the work folder. first: (tiles + 1,), as in `_Shown`. drawn: how many points were drawn, and how many
-    there are in the image. was_there: since an earlier run."""
+    """A view in the work folder. first: (tiles + 1,), as in `_Shown`. masked: how many of its entries are in masks.
+    drawn: how many points were drawn, and how many there are in the image. was_there: since an earlier run."""
 
     key: str
     first: Rows
+    masked: int
     drawn: NDArray[np.int64]
     was_there: bool
 
 
 def _look_at(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _LookedAt:
+    """Render a view, or find it in the work folder; its entries stay there."""
     view = replace(view, masks=view.mask_map())
     key = fingerprint(cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map()))
     was_there = cloud.work.has("view", key)
     entries, drawn = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
     first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
-    return _LookedAt(key, first, drawn, was_there)
+    masked = int(np.count_nonzero(entries["row"] < view.mask_count))
+    return _LookedAt(key, first, masked, drawn, was_there)
 
 
 def _entries(
     view: View, cloud: TiledCloud, drawing: _Drawing, settings: FitSettings
 ) -> tuple[Entries, NDArray[np.int64]]:
-    """What one view shows; and how many points were drawn, and how many there are in the image."""
+    """What one view shows, sorted by point; and how many points were drawn, and how many there are in the image."""
     rows, larger, inside = _worth_drawing(view, cloud, drawing)
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
@@ -297,6 +304,7 @@ def _entries(
     front, _ = without_see_through(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
+    # Four blocks of rows, as ENTRY numbers them: masks, outside, exposure, exposure through holes.
     masks = view.mask_count
     blocks = [(front.weights, 0), (front.outside, masks), (front.exposure, masks + 1)]
     blocks += [] if front.through is None else [(front.through, masks + 2)]
@@ -313,11 +321,12 @@ def _entries(
 def _worth_drawing(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
     """The points in an image that are drawn, how much larger than they are, and how many there are in it.
 
-    Those that lie FINEST_PX apart or more are all drawn; of others a part, by chance, such that they do. Larger in
-    proportion, they cover what all of them did.
+    Points that lie FINEST_PX apart or more are all drawn. Of those closer together some are, drawn by chance so that
+    these lie that far apart; as much larger, they cover what all of them did.
     """
     parts = [_in_image(view.camera, cloud, cloud.tiles.part(tile), drawing) for tile in range(len(cloud.tiles))]
     rows, spacing_px = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    # A point is drawn with the chance that leaves a surface's points ``finest`` apart: by the square, as areas go.
     finest = FINEST_PX
     while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
         finest *= 1.2
@@ -337,6 +346,7 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
         uv_px, depth = camera.project(points.xyz[part])
         focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         size = np.array([camera.width, camera.height])
+        # The steepest slope that a projection is linearized at; there a sphere's image is longest, sqrt(1 + slope^2).
         slope = (np.maximum(center, size - center) + 0.5 * FRUSTUM_MARGIN * size) / focal
         own_px = focal * np.sqrt(1 + slope**2) * (widest / depth)[:, None]
         reach_px = np.sqrt(-2 * np.log(ALPHA_MIN)) * (own_px + np.sqrt(LOW_PASS)) + 1
@@ -374,15 +384,16 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     dismissed = judged.dismissed & (judged.detection_rate > 0)
     if dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
-    groups = replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
+    is_noise = np.append(dismissed, False)[groups.group]  # the last for masks without a group, -1
+    groups = replace(groups, group=np.where(is_noise, -1, groups.group))
     looks = looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
     return _Grouped(groups, looks, votes.typical_openness)
 
 
 @dataclass(frozen=True)
 class _Decided:
-    """What is known of a tile's inner points. ids, certainty: as of `Membership`, ids of looks. in_masks (masks, looks)
-    and outside (views, looks), sparse: what shows of each look's points there."""
+    """What is known of a tile's inner points. ids, certainty: as of `Membership`, but ids are of looks. in_masks:
+    (masks, looks), outside: (views, looks), sparse, what shows of each look's points in each mask, and outside."""
 
     ids: NDArray[np.int32]
     certainty: NDArray[np.float32]
@@ -401,6 +412,7 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     rgb = None if rgb is None else rgb[cloud.members[tile]]
     state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.typical_openness)
     ids = by_look(votes, state.instance_ids, looks)
+    # Points of the margin helped to decide; they are another tile's own, and counted there.
     inner = cloud.inner(tile)
     inner_ids = np.full(len(ids), -1, np.int32)
     inner_ids[inner] = ids[inner]
@@ -429,7 +441,7 @@ def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, decided: S
     What is asked of a table once the points have their ids are sums over the points of an instance: here they are.
     """
     first = np.zeros(len(used), np.int64)
-    labelled = np.flatnonzero(ids >= 0)[::-1]
+    labelled = np.flatnonzero(ids >= 0)[::-1]  # from the last to the first, which is written last and stays
     first[ids[labelled]] = labelled
 
     def at_first(sums: csr_array) -> csr_array:
