@@ -33,10 +33,6 @@ class LeftOut(Enum):
         "points of the choice of splats", "{share:.0%} of the points in the choice of scale and opacity",
         "the rest are enough",
     )
-    PIXELS = (
-        "pixels", "{share:.0%} of the pixels",
-        "points lie {spacing_px:.1f} px apart: one row and column in {stride} is enough",
-    )
     PIXELS_IN_PAPER_MODE = (
         "pixels, mode paper", "{share:.0%} of the pixels",
         "images of at most {most:,} pixels are rendered: one row and column in {stride} is enough",
@@ -74,8 +70,8 @@ def left_out_entry(key: LeftOut, **numbers: Any) -> dict[str, Any]:
 
 
 def with_bar(items: Iterable[Item], name: str, total: int, shown: bool) -> Iterable[Item]:
-    """The items, with a bar of the remaining time where stderr is a terminal and tqdm is installed: not all that takes
-    long needs more than numpy."""
+    """The items, with a bar of the remaining time where stderr is a terminal and tqdm is installed. The base install,
+    numpy and onnxruntime, has long work too, and does it without a bar."""
     if not shown or find_spec("tqdm") is None:
         return items
     from tqdm import tqdm
@@ -115,7 +111,8 @@ class Journal:
 
     @contextmanager
     def bars(self) -> Iterator[Callable[[str, int, int, float], None] | None]:
-        """A function to call with a stage's name, the step just done, the number of steps and the loss: a bar of it."""
+        """A function to call with a stage's name, the step just done, the number of steps and the loss: it moves a bar.
+        None where none is shown. Needs tqdm, of the extra 'fit'."""
         if not self.progress:
             yield None
             return
@@ -130,7 +127,7 @@ class Journal:
                     bar.reset(steps)
                     bar.set_description_str(f"{name:<16}: ", refresh=False)
                 bar.set_postfix(loss=f"{loss:.3g}", refresh=False)
-                bar.update(step - bar.n)
+                bar.update(step - bar.n)  # a training that was taken up begins at a later step
 
             yield report
 

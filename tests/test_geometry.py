@@ -18,12 +18,11 @@ from og_pointcloud.rendering.geometry import (
     near_plane,
     nearest_in,
     neighbourhood,
-    pixels_per_spacing,
     sample_of_points,
     strided,
 )
 from og_pointcloud.rendering.splatting import NEAR_SHARE
-from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import GeometrySettings
 
 SETTINGS = GeometrySettings()
@@ -136,13 +135,6 @@ def frontal(distance: float, focal: float = 100.0) -> View:
     pose = np.eye(4)
     pose[2, 3] = distance
     return empty_view(Camera(40, 30, focal, focal, 20, 15, pose))
-
-
-def test_pixels_per_spacing_of_a_lattice_seen_from_the_front() -> None:
-    points = Points(grid(20, 0.1), np.zeros(3))
-    spacing = neighbourhood(points.xyz, SETTINGS).spacing
-    np.testing.assert_allclose(pixels_per_spacing(points, spacing, [frontal(4.0)]), 100 * 0.1 / 4, rtol=0.05)
-    assert pixels_per_spacing(points, spacing, [frontal(-4.0)]) == 1.0  # nothing in front
 
 
 def test_near_plane_is_a_share_of_the_depth_of_what_is_in_front() -> None:

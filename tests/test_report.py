@@ -231,7 +231,7 @@ def test_points_shown_mostly_outside_of_masks_lose_their_label():
 
 
 def test_the_report_names_what_is_left_out_and_what_failed(tmp_path):
-    entry = left_out_entry(LeftOut.PIXELS, share=0.75, spacing_px=4.0, stride=2)
+    entry = left_out_entry(LeftOut.PIXELS_IN_PAPER_MODE, share=0.75, most=76_800, stride=2)
     default = replace(row(2.0, 0.1, "default", ""), left_out=(entry,))
     others = (row(1.0, 0.2, "views", "one of |2|"), row(3.0, 0.4, BASELINE, "direct uplift"))
     found = Sweep((default, *others), {"c, mode: fast": "no mask"})

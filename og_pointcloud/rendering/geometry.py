@@ -1,12 +1,13 @@
 """What a fit asks of points before anything is drawn: spacing, neighbours, samples, the pixels worth looking at.
 
-A plain cloud's points are drawn as isotropic Gaussians of a share of their own spacing; `fitting.held_out` chooses it.
+A plain cloud's points are drawn as isotropic Gaussians of a share of their own spacing; `fitting.held_out` chooses the
+share.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,9 +21,9 @@ from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
 TAMED_BY = 16
-"""Neighbours whose median spacing a point's own may not exceed."""
+"""A point's spacing is at most the median spacing of this many neighbours."""
 ROWS_AT_ONCE = 1 << 18
-"""Points whose neighbours are looked up at once: what the look-up returns is three times what is kept."""
+"""Points whose neighbours are looked up at once: the look-up returns three times as many bytes as are kept."""
 
 
 @dataclass(frozen=True)
@@ -39,19 +40,20 @@ class Neighbourhood:
 def nearest_in(tree: cKDTree, xyz: NDArray[np.floating], k: int = 1) -> tuple[NDArray[np.float64], NDArray[Any]]:
     """Distance and index of the k points of a tree nearest to each, on all cores: (N,), or (N, k) of several.
 
-    Asked in a thread of its own, which Ctrl-C waits for: those that scipy starts would go on in memory that is gone.
+    The look-up runs in a thread of its own, which Ctrl-C waits for: else the threads that scipy starts would go on, in
+    memory that is freed.
     """
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(int).result()  # from now on there is a thread to wait for
+        pool.submit(int).result()  # starts the thread: from now on there is one to wait for
         distance, index = pool.submit(tree.query, xyz, k=k, workers=-1).result()
     return np.asarray(distance), np.asarray(index)
 
 
 def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighbourhood:
-    """Spacing and neighbours of every point.
+    """Spacing and neighbours of every point. xyz: (n, 3), any unit.
 
-    A floater's own spacing says nothing of a surface: it is held to the median spacing of its neighbours.
-    Duplicates have none: they take the scene's. One point alone has spacing 1.
+    A floater's own spacing says nothing about a surface: it is held to the median spacing of its neighbours.
+    Duplicates have spacing 0: they take the scene's median. One point alone has spacing 1.
     """
     n = len(xyz)
     k = min(settings.neighbours, n - 1)
@@ -63,42 +65,33 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
         away, near = nearest_in(tree, xyz[rows], k + 1)
         # The point itself is usually first, but not always among duplicates.
         itself = near == np.arange(n)[rows, None]
-        itself[~itself.any(axis=1), -1] = True
+        itself[~itself.any(axis=1), -1] = True  # more duplicates than k: leave out the last of them instead
         distance[rows], index[rows] = away[~itself].reshape(-1, k), near[~itself].reshape(-1, k)
     spacing = distance[:, :3].mean(axis=1)
     typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
     spacing = np.where(spacing > 0, spacing, typical)
     spacing = np.minimum(spacing, np.median(spacing[index[:, :TAMED_BY]], axis=1)).astype(np.float32)
+    # Where points are denser than is typical, they adjoin as far as elsewhere.
     adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
     return Neighbourhood(spacing, index, adjoining)
 
 
 def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
     """Depth of the near plane: a share of the median depth at which cameras see the cloud. Never 0."""
-    sample = xyz[:: 1 + len(xyz) // 20_000].astype(np.float64)  # once for all cameras
+    sample = xyz[:: 1 + len(xyz) // 20_000].astype(np.float64)  # enough for a median; once for all cameras
     depths = [_depths(sample, camera) for camera in cameras]
     front = np.concatenate([depth[depth > 0] for depth in depths])
     return NEAR_SHARE * float(np.median(front)) if len(front) else 1e-6
 
 
-def pixels_per_spacing(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
-    """How many pixels apart neighbouring points lie in the images, median over the points in front of the cameras."""
-    step = 1 + len(points) // 20_000
-    apart = []
-    for view in views:
-        depth = _depths(points.xyz[::step], view.camera)
-        front = depth > 0
-        apart.append(np.sqrt(view.camera.fx * view.camera.fy) * spacing[::step][front] / depth[front])
-    seen = np.concatenate(apart)
-    return float(np.median(seen)) if len(seen) else 1.0
-
-
 def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.float32]:
     """(n,) float32 in [0, 1), by place and name alone: a sample drawn by it does not depend on the points' order."""
+    # The bits of the coordinates, mixed by odd constants (those of xxHash).
     bits = np.ascontiguousarray(xyz + np.float32(0)).view(np.uint32)  # -0 becomes 0
     value = bits[:, 0] * np.uint32(0x9E3779B1) ^ bits[:, 1] * np.uint32(0x85EBCA77) ^ bits[:, 2] * np.uint32(0xC2B2AE3D)
     value ^= np.uint32(zlib.crc32(name.encode()))
-    # Each bit of the input changes half of those that are used (finaliser of MurmurHash3, public domain).
+    # Each bit of the input changes half of the bits of the result (finaliser of MurmurHash3, public domain). The upper
+    # 24 of them are as many as float32 holds exactly.
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
     return (((value ^ (value >> np.uint32(16))) >> np.uint32(8)) * 2.0**-24).astype(np.float32)
@@ -115,11 +108,13 @@ def sample_of_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
 def distinct_places(xyz: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the first point at each place, ascending, and for every point which of these rows is its place."""
     everyone = np.arange(len(xyz))
+    # A 64-bit hash of each place: where all differ, so do the places; equal ones may be a collision, so look closer.
     bits = np.ascontiguousarray(xyz + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
     key = bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     ordered = np.sort(key)
     if (ordered[1:] != ordered[:-1]).all():  # nearly every cloud; a fifth of the time that looking closer takes
         return everyone, everyone
+    # np.unique numbers places by their coordinates; rank numbers them by their first point.
     _, first, place = np.unique(xyz + np.float32(0), axis=0, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
@@ -131,6 +126,7 @@ def strided(camera: Camera, stride: int) -> Camera:
     first = stride // 2
 
     def center(c: float) -> float:
+        """Pixel i of the result is pixel first + stride i, and centers of pixels lie at halves."""
         return (c - first - 0.5) / stride + 0.5
 
     return replace(
@@ -154,7 +150,7 @@ def thinned(view: View, stride: int) -> View:
 
 
 def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
-    """Round Gaussians of ``scale`` spacings."""
+    """Round Gaussians with a standard deviation of ``scale`` times each point's spacing."""
     n = len(points)
     rotation = np.zeros((n, 4), np.float32)
     rotation[:, 0] = 1
@@ -163,4 +159,5 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
 
 
 def _depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
+    """(n,) depths along the camera's axis, scene units; negative behind it."""
     return xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

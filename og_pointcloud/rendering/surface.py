@@ -16,30 +16,25 @@ from og_pointcloud.rendering.geometry import (
     isotropic,
     near_plane,
     neighbourhood,
-    pixels_per_spacing,
     thinned,
 )
 from og_pointcloud.rendering.splatting import Gaussians
-from og_pointcloud.scene import Points, Scene, View
+from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
-
-PIXELS_PER_SPACING, MOST_STRIDE = 2, 3
-"""Mode paper renders every row and column of these images again and again: two pixels between neighbouring points show
-all that there is of them, but the edges of masks, which are drawn in pixels, want one in three at least."""
 
 
 @dataclass(frozen=True)
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position. n below is the number of its points.
+    scene: with one point per position (Gaussians all stay). n below is the number of its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here.
     neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
-    stride: every stride-th row and column of the images is used.
-    by_sight: views are asked which masks a point lies in along its own ray (sightings.py), as for plain clouds, whose
-    Gaussians are of our making; else how much of each mask it paints (splatting.py), as the paper does.
+    stride: every stride-th row and column of the images is used; 1 but in mode paper.
+    by_sight: a view tells which mask a point lies in along the point's own ray (sightings.py), as for plain clouds,
+    whose Gaussians are of our making; else how much each Gaussian paints of each mask (splatting.py), as in the paper.
     """
 
     scene: Scene
@@ -67,15 +62,13 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
-        gaussians = _gaussians(scene, around, near, settings, journal)
+        gaussians = _gaussians(scene, around, settings, journal)
         by_sight = not scene.points.are_gaussians and settings.mode != "paper"
         spacing, typical = around.spacing, float(np.median(around.spacing))
         thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=by_sight)
-        stride = 1
-        if settings.mode == "paper":
-            stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal)
-        elif not by_sight:
-            stride = pixel_stride(scene.points, around.spacing, scene.views, journal)
+        # Only mode paper renders a view more than once.
+        is_paper = settings.mode == "paper"
+        stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal) if is_paper else 1
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
 
 
@@ -95,7 +88,8 @@ def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray
     return replace(scene, points=points.take(first)), row_of_point
 
 
-def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSettings, journal: Journal) -> Gaussians:
+def _gaussians(scene: Scene, around: Neighbourhood, settings: FitSettings, journal: Journal) -> Gaussians:
+    """The file's own Gaussians; of a plain cloud round ones, whose size `held_out` may change later."""
     if scene.points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return Gaussians.from_points(scene.points)
@@ -108,7 +102,8 @@ def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSe
 def sight_thickness(
     spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings
 ) -> NDArray[np.float32]:
-    """(n,) how far before a point others must lie to hide it: noise and overlap make a surface so thick."""
+    """(n,) how far in front of a point others must lie to hide it, scene units: noise and overlap make a surface so
+    thick. At least a typical spacing counts, however dense points are."""
     return (settings.sight_thickness * np.maximum(spacing, typical_spacing)).astype(np.float32)
 
 
@@ -122,27 +117,16 @@ def surface_thickness(
     """
     if by_sight:
         return sight_thickness(spacing, typical_spacing, settings)
-    # Blending knows the front of a surface by a half-covered pixel only, anywhere within the thickness of the surface.
+    # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
+    # so twice as thick, and a splat reaches three standard deviations beyond its center.
     thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
-
-
-def pixel_stride(points: Points, spacing: NDArray[np.float32], views: Sequence[View], journal: Journal) -> int:
-    """Use every stride-th pixel of the masks: pixels much finer than the points see nothing new."""
-    if points.are_gaussians:
-        return 1
-    spacing_px = pixels_per_spacing(points, spacing, views)
-    smallest = min(min(view.camera.width, view.camera.height) for view in views)
-    stride = int(np.clip(spacing_px / PIXELS_PER_SPACING, 1, min(MOST_STRIDE, smallest)))
-    if stride > 1:
-        journal.leave_out(LeftOut.PIXELS, share=1 - 1 / stride**2, spacing_px=round(spacing_px, 3), stride=stride)
-    return stride
 
 
 def stride_for_pixels(views: Sequence[View], most: int, journal: Journal) -> int:
     """The least stride that leaves the largest image no more than ``most`` pixels."""
     largest = max(view.camera.width * view.camera.height for view in views)
-    smallest = min(min(view.camera.width, view.camera.height) for view in views)
+    smallest = min(min(view.camera.width, view.camera.height) for view in views)  # a row and column of each stay
     stride = min(max(1, int(np.ceil(np.sqrt(largest / most)))), smallest)
     if stride > 1:
         journal.leave_out(LeftOut.PIXELS_IN_PAPER_MODE, share=1 - 1 / stride**2, most=most, stride=stride)
