@@ -27,7 +27,7 @@ def use_threads(count: int) -> None:
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit`; where there is no folder that compiled code can be kept in, it is compiled anew in each process."""
+    """`numba.njit`; where numba finds no folder to keep compiled code in, each process compiles it anew."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         try:

@@ -2,7 +2,7 @@
 
 Feature rows: what the encoder saw of each instance, over all views (paper, Sec. 3.3). The paper matches each instance
 with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks of an instance are known from
-grouping, and how much each shows of it is a product with the mask table, with true visibility. A mask counts by the
+grouping, and the mask table tells how much each shows of it, with true visibility. A mask counts by the
 cube root of the pixels that it shows of the instance: by pixels, one close-up with a wrong name would outvote three
 views from twice as far. (Powers from 1/4 to 1/2 label scenes within 0.004 mIoU of each other.) Masks that disagree with
 the rest are left out.
@@ -11,10 +11,10 @@ Parts: a handle has masks of its own in some views, while most views show it wit
 instances a and b, over the views that see both and have a mask of b:
 
     held     views in which most of what shows of a lies in a mask of b
-    a is a part of b where held / all of them is a majority, and some view shows a in a mask of its own
+    a is a part of b where held is a majority of these views, and some view shows a in a mask of its own
 
-No mask is needed that no view has: a parent is always an instance too. Where masks never show the parent, or never the
-part, nothing is found. Works alike for groups of masks and for the leaves of a codebook.
+A parent is always an instance too: where masks never show the parent, or never the part, nothing is found. Groups of
+masks and the leaves of a codebook are treated alike.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.mask_table import MaskTable
 
 MOSTLY = 0.5
-"""A part lies mostly in one mask of its parent: more than this share of what a view shows of it, in more than this
-share of the views."""
+"""A view shows a part in its parent where more than this share of what it shows of the part lies in one mask of the
+parent; more than this share of the views must do so."""
 SEEN_SHARE = 0.1
 """A view that shows less of an instance than this share of its typical view is no evidence about it."""
 FEWEST_VIEWS = 2
-"""Views that show a part in its parent at least: one alone could be a mask that spilled over."""
+"""At least so many views show a part in its parent: one alone could be a mask that spilled over."""
 
 
 def describe_instances(
@@ -51,6 +51,7 @@ def describe_instances(
     features = directions(table.mask_features)
     rows, owners = [], []
     agreement = np.zeros(count, np.float32)
+    # Masks that show nothing of their instance, or have no feature, say nothing of what it is.
     for instance, members in enumerate(members_of(np.where((shown > 0) & features.any(axis=1), group, -1), count)):
         weight = np.cbrt(shown[members])
         row, kept, cosines = robust_mean(features[members], weight)
@@ -59,6 +60,7 @@ def describe_instances(
         rows.append(row)
         owners.append(instance)
         agreement[instance] = np.average(cosines[kept], weights=weight[kept])
+    # A view counts once, with however many masks it shows the instance.
     grouped = group >= 0
     pairs = np.unique(np.stack([group[grouped], table.mask_view[grouped]]), axis=1)
     return InstanceTable(
@@ -87,6 +89,7 @@ def shown_of_instance(
 
 def members_of(group: NDArray[np.int32], count: int) -> list[NDArray[np.intp]]:
     """The masks of each of ``count`` groups, ascending. group: (masks,) int32, the group of each mask, -1 none."""
+    # The pieces before group 0 (no group) and after the last are dropped.
     order = np.argsort(group, kind="stable")
     return np.split(order, np.searchsorted(group[order], np.arange(count + 1)))[1:-1]
 
@@ -109,10 +112,11 @@ def robust_mean(
     kept = np.ones(len(features), bool)
     cosines = np.zeros(len(features))
     mean = None
+    # Twice: with all rows, to find the outliers, and without them.
     for _ in range(2):
         total = weight[kept] @ features[kept]
         length = np.linalg.norm(total)
-        if length < 1e-12:
+        if length < 1e-12:  # no row, or rows that cancel
             return None, kept, cosines
         mean = total / length
         cosines = features @ mean
@@ -134,6 +138,7 @@ def part_of(
     rows, masks = np.flatnonzero(instance_ids >= 0), len(mask_instance)
     of_instance = csr_array((np.ones(len(rows)), (rows, instance_ids[rows])), shape=(len(instance_ids), count))
     of_view = csr_array((np.ones(masks), (table.mask_view, np.arange(masks))), shape=(table.outside.shape[0], masks))
+    # What each mask, and each view, shows of each instance; which views show enough of it, and which have a mask of it.
     shown = (table.weights @ of_instance).tocoo()  # (masks, count), sparse: of ten thousand instances gigabytes
     seen = (table.outside @ of_instance + of_view @ shown).toarray()  # (views, count), in masks and outside
     sees = seen > SEEN_SHARE * _typical(seen)
@@ -141,18 +146,22 @@ def part_of(
     has_mask = np.zeros(seen.shape, bool)  # view, instance
     has_mask[table.mask_view[owned], mask_instance[owned]] = True
 
+    # From here on an entry is a mask and an instance (part) that shows in it; whole is the instance of the mask.
     mask, part = shown.row, shown.col
     view, whole = table.mask_view[mask], mask_instance[mask]
     within = (shown.data > MOSTLY * seen[view, part]) & sees[view, part]
     has_own_mask = np.zeros(count, bool)
     has_own_mask[part[within & (whole == part)]] = True
+    # A whole has more points than its part, so that there are no cycles.
     size = np.bincount(instance_ids[rows], minlength=count)
     holds = within & (whole >= 0) & sees[view, whole] & has_own_mask[part] & (size[whole] > size[part])
+    # Of each pair (part, whole): the views that hold it, of those that could: they see both, and have a mask of b.
     pairs, held = np.unique(np.stack([part[holds], whole[holds]]), axis=1, return_counts=True)
     part, whole = pairs[:, held >= FEWEST_VIEWS]
     possible = [np.count_nonzero(sees[:, a] & sees[:, b] & has_mask[:, b]) for a, b in zip(part, whole, strict=True)]
     share = held[held >= FEWEST_VIEWS] / np.array(possible)
 
+    # By part, then the largest share, the smallest whole, the lowest number.
     best = np.lexsort((whole, size[whole], -share, part))
     best = best[share[best] > MOSTLY]
     parent = np.full(count, -1, np.int32)

@@ -1,9 +1,9 @@
 """Colors of adjoining points -> how much likelier these are of one thing than of two, as this scene has it.
 
 Votes are torn along borders: rays slip past edges, masks are ragged, and noise puts a point of the wall before the
-lamp. A point's color is its own, wherever the noise put it. How much a difference of color says is for the scene to
-tell (textures, light, how well colors and points fit each other): of adjoining points, by how sure views are of their
-states, how often is there a difference as large within one state, and how often between two?
+lamp. A point's color is its own, wherever the noise put it. How much a difference of color says depends on the scene
+(textures, light, how well colors and points fit each other), so it is counted there, on adjoining points of whose
+states views are sure: how often is a difference as large within one state, and how often between two?
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from og_pointcloud.rendering.geometry import Neighbourhood
 DIFFERENCES = 443
 """Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
 LEAST_PAIRS = 30
-"""Sure pairs within one state, and between two, below which a scene's colors are not asked."""
+"""Colors are not asked in a scene with fewer sure pairs than this within one state, or between two."""
 SURENESS_POWER = 4
-"""A pair of points counts by this power of the sureness of both: borders that views disagree about lie elsewhere."""
+"""A pair of points counts by this power of the sureness of both: where views disagree, the border lies elsewhere."""
 MOST = 9.0
-"""No difference counts as more times likelier within one thing than between two, or the other way round."""
+"""No difference counts as more than this many times likelier within one thing than between two, or the reverse."""
 
 
 def color_ratios(
@@ -36,13 +36,16 @@ def color_ratios(
     none = np.ones(DIFFERENCES, np.float32)
     if rgb is None:
         return none
-    voice = np.rint(256 * sureness**SURENESS_POWER) / 256  # in such steps sums are exact, whatever the order of points
+    # In steps of 1/256 the products, and so their sums in float64, are exact: the points' order does not matter.
+    voice = np.rint(256 * sureness**SURENESS_POWER) / 256
     one, two = _counted(np.ascontiguousarray(rgb), ids, voice, around.index, around.adjoining)
     if min(one.sum(), two.sum()) < LEAST_PAIRS:
         return none
-    # The chance of one state, if one and two were as frequent; a smaller difference never speaks less for one.
+    # The chance of one state given the difference, as if pairs of one state and of two were equally frequent: most
+    # neighbors are of one state, which says nothing about colors.
     one, both = one / one.sum(), one / one.sum() + two / two.sum()
     seen = np.flatnonzero(both)
+    # Counts are noisy; a larger difference never speaks more for one state. Differences not seen are interpolated.
     chance = isotonic_regression(one[seen] / both[seen], weights=both[seen], increasing=False).x
     chance = np.clip(np.interp(np.arange(DIFFERENCES), seen, chance), 1 / (1 + MOST), MOST / (1 + MOST))
     return (chance / (1 - chance)).astype(np.float32)
@@ -51,7 +54,7 @@ def color_ratios(
 def neighbour_weights(
     rgb: NDArray[np.uint8] | None, around: Neighbourhood, ratios: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(n, k) float32: the ratio of each point and its adjoining ones; 0 for neighbours that do not adjoin."""
+    """(n, k) float32: for each point and neighbour the ratio of their difference; 0 for those that do not adjoin."""
     if rgb is None or (ratios == 1).all():
         return around.adjoining.astype(np.float32)
     return _weights(np.ascontiguousarray(rgb), around.index, around.adjoining, ratios)
@@ -59,6 +62,7 @@ def neighbour_weights(
 
 @njit(cache=True)
 def _difference(a, b):  # noqa: ANN001, ANN202
+    """Euclidean distance of two colors, rounded. In float64: differences of uint8 would wrap around."""
     total = 0.0
     for channel in range(3):
         total += (float(a[channel]) - float(b[channel])) ** 2
@@ -72,6 +76,7 @@ def _counted(rgb, ids, voice, neighbours, adjoining):  # noqa: ANN001, ANN202
     for g in range(len(ids)):
         if voice[g] == 0:
             continue
+        # Two points that are each other's neighbor count twice: shares are what is used, not numbers.
         for k in range(neighbours.shape[1]):
             other = neighbours[g, k]
             if adjoining[g, k] and voice[other] > 0:

@@ -45,12 +45,12 @@ def fit(
 
     work: a folder in which the views of a long fit, and the training of mode "paper", are kept, so that the next call
     goes on where this one was interrupted or killed; its files are removed at the end. None: nothing is kept.
-    executor: of `concurrent.futures`, takes the tiles and views of a fit in tiles as tasks; its workers see the work
-    folder, or, without one, the folder for temporary files, by the same path. The result is the same, bit for bit.
+    executor: of `concurrent.futures`, takes the tiles and views of a fit in tiles as tasks. Its workers must see the
+    work folder (without one, the folder for temporary files) by the same path. The result is the same, bit for bit.
     progress: show bars on a terminal.
 
-    The capture is checked first, and the answer last (og_pointcloud.checking): what does not fit together is warned of
-    by a `CaptureWarning`; provenance["checks"] has every check. They change no label.
+    The capture is checked first, and the answer last (og_pointcloud.checking). A `CaptureWarning` says what does not
+    fit together; provenance["checks"] has every check. They change no label.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud), and OgPointcloudError where memory or
@@ -78,6 +78,7 @@ def fit(
     with journal.stage("checks"):
         checks = check_capture(scene)
     warn_of_doubts(checks)
+    # The folder's files are removed once the cloud is made: only a run that ends before leaves them.
     with WorkFolder.open(work) as kept:
         if needs_tiles(scene, settings):
             _check(scene, journal)
@@ -85,6 +86,7 @@ def fit(
             cloud = _labelled_cloud(scene, labelling, spacing, settings, journal)
         else:
             prepared = prepare(scene, settings, journal, kept)
+            # A temporary folder goes with the run: checkpoints in it would serve nobody.
             cloud = fit_prepared(prepared, settings, journal, None if work is None else kept)
     found = check_cloud(cloud, checks)
     warn_of_doubts(found)
@@ -96,8 +98,8 @@ class Prepared:
     """What the stages before labelling found; all modes but "paper", which draws points differently, share it.
 
     scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface,
-    but for what lies behind an object whose mask it is in (membership.without_see_through). Its views are photographs:
-    those cut from one are one, but in mode "paper".
+    without what lies behind a mask's object (membership.without_see_through). Views cut from one photograph are one
+    view of the table, except in mode "paper".
     """
 
     scene: Scene
@@ -139,12 +141,13 @@ def fit_prepared(
     labelling = labeller(prepared.table, surface, settings, journal)
     labelling = _with_reliability(labelling, prepared, settings, journal)
     spacing = float(np.median(surface.neighbourhood.spacing))
+    # Labels are of the surface's points; points at the same place were left out of it and get the same label.
     labelling = labelling.of_points(surface.row_of_point)
     return _labelled_cloud(prepared.scene, labelling, spacing, settings, journal)
 
 
 def _with_reliability(labelling: Labelling, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
-    """The labelling with what half of the views say of each instance."""
+    """The labelling with the reliability of each instance; a warning where the scene's is low."""
     with journal.stage("reliability"):
         found = split_half(prepared.table, prepared.surface, labelling, settings)
     if found is None:
@@ -170,6 +173,7 @@ def _check(scene: Scene, journal: Journal) -> None:
 
 def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
     """The surface with a plain cloud's points drawn as large as held-out views find best."""
+    # Trained Gaussians have their size; mode paper draws points as full as those.
     if not surface.by_sight:
         return surface
     points, spacing = surface.scene.points, surface.neighbourhood.spacing
@@ -180,10 +184,11 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
 
 
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:
-    """The mask table of a surface, without what its masks show behind their objects; neither the table nor the views
-    that are worked on side by side outgrow their share of the memory."""
+    """The mask table of a surface, without what its masks show behind their objects. The table, and the views that are
+    worked on side by side, each keep to their share of the memory."""
     visibility, views = settings.visibility, surface.scene.views
     with journal.stage("visibility"):
+        # As many views at once as fit into their share, one at least; the table gets its share of what they leave.
         left = memory_left(settings.memory)
         largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
         one_view = working_memory(len(surface.gaussians), largest)
@@ -206,11 +211,12 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             "on_disk": in_file(table.exposure.data),
             "views_side_by_side": at_once,
         }
-        if work.found:
+        if work.found:  # views that an interrupted fit left
             journal.leave_out(
                 LeftOut.RENDERING, count=work.found, folder="" if work.folder is None else work.folder.name
             )
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
+        # Areas were counted in pixels of the thinned images.
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
         table = front_surfaces(surface, table, settings, journal)
         # Mode paper draws views again, and asks for the masks of each.
@@ -221,6 +227,7 @@ def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, jo
     """The table without what its masks show behind their objects (`membership.without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
     poses = np.stack([camera.world_to_camera for camera in cameras])
+    # Of the full images, as the masks' areas are by now.
     focal = np.sqrt([camera.fx * camera.fy for camera in cameras])
     table, share = without_see_through(table, surface.gaussians, poses, focal, settings.membership)
     journal.notes["seen_through"] = round(share, 5)
@@ -246,7 +253,7 @@ def _labelled_cloud(
         spacing=spacing,
         reach=settings.geometry.reach * spacing,
         rgb=scene.points.rgb,
-        certainty=None if certainty is None else np.rint(255 * certainty).astype(np.uint8),
+        certainty=None if certainty is None else np.rint(255 * certainty).astype(np.uint8),  # as files keep it
         provenance=journal.provenance(settings),
         cameras=tuple(view.camera for view in scene.views),
     )

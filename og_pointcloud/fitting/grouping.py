@@ -5,14 +5,16 @@ Two masks of two views show the same thing as far as they share Gaussians that b
     N_ij = sum_g A_ig A_jg            mass that mask i and mask j share
     N_ib = sum_g A_ig s_bg            mass of mask i that view b sees at all (s = masked + unmasked weight)
 
-so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. From it, per mask and view, its
+so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. From it follows, per mask and view, its
 *container*: the one mask of that view holding most of it, if there is one. Each view is thus a witness for every pair
-of masks it contains: "one thing" (same container) or "two" (different ones). A view that missed an object says
-nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one thing":
-a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
-Where masks have tracks, the tracker is one witness more: it says "one thing" of two masks with the same track, also of
-the front and the back of a thing, of which no view can say it, and "two" where their tracks were in one image. Of other
-tracks it says nothing: what was out of sight comes back with another number.
+of masks that have containers in it: "one thing" (the same container) or "two" (different ones). A view that missed an
+object says nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one
+thing": a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
+
+Where masks have tracks, the tracker is one witness more. It says "one thing" of two masks with the same track, also of
+the front and the back of a thing, which no view sees together, and "two" where their tracks were in one image. About
+other pairs it says nothing: what was out of sight comes back with another number.
+
 The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is
 ours.
 """
@@ -32,7 +34,7 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
 
 UNKNOWN_LIKENESS = 0.25
-"""Of features of which nothing is known: the expected square of a uniform share lies near a quarter."""
+"""Likeness where features say nothing: that of the middle rank, a half squared (`_likeness`)."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class MaskGroups:
 def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np.int64] | None = None) -> MaskGroups:
     """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance.
 
-    sample: columns that overlaps are measured on: means over thousands of points need no more. None: all.
+    sample: the columns that overlaps are measured on; means over thousands of points need no more. None: all.
     """
     share = mask_shares(table if sample is None else table.of_points(sample), settings)
     spanning = _spanning_masks(share, table.mask_view, settings)
@@ -68,8 +70,8 @@ def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
     """
     votes = view_votes(table.with_holes())
     weights, seen = votes.in_mask, votes.vote
-    together = (weights @ weights.T).tocoo()
-    visible = (weights @ seen.T).toarray()
+    together = (weights @ weights.T).tocoo()  # N_ij
+    visible = (weights @ seen.T).toarray()  # N_ib
     own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
     rows, cols = together.row, together.col
     base = visible[rows, table.mask_view[cols]]
@@ -95,6 +97,7 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
     views = int(mask_view.max(initial=-1)) + 1
     inside = _lookup(share, entries.col, entries.row)  # share of j in i
     part = inside > settings.container_share
+    # A cell for each mask i and view: how much of i that view's largest mask holds, and how much its parts of i cover.
     cell = entries.row.astype(np.int64) * views + mask_view[entries.col]
     size = len(mask_view) * views
     largest = np.zeros(size)
@@ -110,7 +113,7 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
 
 def _lookup(matrix: csr_array, rows: NDArray[np.int32], cols: NDArray[np.int32]) -> NDArray[np.float64]:
     """Entries of a sparse matrix, 0 where it has none."""
-    matrix.sort_indices()  # as those of shares are
+    matrix.sort_indices()  # so that keys, row by row, ascend
     entries = matrix.tocoo()
     width = np.int64(matrix.shape[1])
     keys = entries.row * width + entries.col
@@ -140,11 +143,13 @@ def _containers(
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """Per pair of masks (rows, ascending, and cols, both ways) that any view, or the tracker, shows as one thing: how
-    many do, and how many of these whatever the features say: all if the two masks have the same extent, else the
-    tracker alone. speaks, hears: (masks, views + tracks), of which speaks[i] @ hears[j] is how many witnesses say
-    anything of a pair: views in which both have a container, and the tracker where both tracks are the same or were in
-    one image."""
+    """What views, and the tracker, say of pairs of masks.
+
+    rows, cols: the pairs that any of them shows as one thing, both ways, rows ascending. one: how many say so.
+    same_extent: how many of these count whatever the features say: all if the two masks have the same extent, else the
+    tracker alone. speaks, hears: (masks, views + tracks); speaks[i] @ hears[j] is how many witnesses say anything of a
+    pair: views in which both have a container, and the tracker where both tracks are the same or were in one image.
+    """
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]
@@ -159,15 +164,18 @@ def _witnesses(share: csr_array, container: csr_array, table: MaskTable, setting
     speaks = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
     hears, followed = speaks, indicator(np.full(len(speaks), -1, np.int32), len(speaks))  # no pair
     if table.mask_track is not None:
+        # Tracks as 0, 1, ..., -1 none: np.unique counts -1 as a value, the subtraction takes it away again.
         track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
         tracks = indicator(track.astype(np.int32), int(track.max(initial=-1)) + 1)
         followed = csr_array(tracks.T @ tracks)
         in_view = tracks @ indicator(table.mask_view, views).T
-        together = (in_view @ in_view.T).toarray() > 0
+        together = (in_view @ in_view.T).toarray() > 0  # tracks in one image, each with itself too
+        # A mask speaks in the column of its track, and hears in those of all tracks that were in an image with it.
         speaks, hears = (np.column_stack([speaks, of_track]) for of_track in (tracks.T.toarray(), tracks.T @ together))
     pairs = csr_array(container @ container.T + followed).tocoo()
     off_diagonal = pairs.row != pairs.col
     rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
+    # Of the same extent: either lies mostly in the other.
     smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
     sure = np.where(smaller > settings.container_share, one, _lookup(followed, rows, cols))
     return _Witnesses(rows, cols, one, sure, speaks, hears)
@@ -185,9 +193,10 @@ def _agglomerate(
     The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
     are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
     a table whose view missed the cup: then the witnesses count as far as the features are alike.
-    Of pairs that agree alike the one with more witnesses comes first, then the one with more alike features: the order
-    of views and masks does not matter.
+    Of pairs with the same agreement the one with more witnesses comes first, then the one with more similar features:
+    the order of views and masks does not matter.
     """
+    # A group's number is that of its lowest mask; features are summed, not averaged: only their direction is asked.
     w, everyone = witnesses, np.arange(len(usable) + 1)
     kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
     links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
@@ -202,7 +211,7 @@ def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.i
     encoder: they calibrate its cosines."""
     cosines = [np.zeros(0)]
     for view in np.unique(mask_view):
-        rows = features[mask_view == view][:200]
+        rows = features[mask_view == view][:200]  # 20,000 pairs of a view are enough
         cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
     return np.sort(np.concatenate(cosines))
 
@@ -219,14 +228,17 @@ def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
     rows = [slice(start[a], start[a + 1]) for a in range(len(group))]
     linked = [(others[row], one[row], same_extent[row]) for row in rows]
     version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
-    # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then.
+    # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then. (An
+    # empty list of a known type, which numba needs.)
     heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
     for a in range(len(group)):
         _offer(heap, a, a, linked[a], said, version, different, majority)
     while len(heap):
         _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
+        # Stale: one of the two has grown or joined another since it was offered; what it is now was offered anew.
         if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
             continue
+        # The higher number joins the lower one, which takes on all that either says.
         group[b] = a
         version[a] += 1
         speaks[a] += speaks[b]
@@ -244,7 +256,7 @@ def _offer(heap, a, above, links, said, version, different, majority):  # noqa: 
     speaks, hears, features, length = said
     for b, one, same_extent in zip(*links):  # noqa: B905
         asked = np.dot(speaks[b], hears[a])
-        if b <= above or one / asked <= majority:  # whatever their features
+        if b <= above or one / asked <= majority:  # features only ever take agreement away
             continue
         both = length[a] * length[b]
         cosine = np.dot(features[a], features[b]) / both if both > 0 else 0.0
@@ -260,6 +272,7 @@ def _likeness(cosine, different):  # noqa: ANN001, ANN202
     """The share of different things that are less alike, squared."""
     if not len(different):
         return UNKNOWN_LIKENESS
+    # The mean of the ranks with and without equal ones; cosines within rounding are equal.
     below = np.searchsorted(different, cosine - 1e-6, "left") + np.searchsorted(different, cosine + 1e-6, "right")
     return (0.5 * below / len(different)) ** 2
 

@@ -1,7 +1,7 @@
 """What a mask shows through holes between the points of its own object.
 
-A table top of few points lets the floor through, all over, and seen at a slant it reaches as deep as the floor begins:
-no gap in depth parts the two over the mask as a whole. Around each point it does.
+A table top of few points lets the floor through everywhere, and seen at a slant its far edge lies as deep as the floor
+begins: over the mask as a whole no gap in depth parts the two. Around each point there is one.
 """
 
 from __future__ import annotations
@@ -11,26 +11,27 @@ import numpy as np
 from og_pointcloud.kernels import njit
 
 WINDOW = 24
-"""Points looked at around one, about: as many as adjoin."""
+"""About how many points are looked at around one: as many as `GeometrySettings.neighbours`."""
 STRAIGHT_EDGE = 2 / np.pi
-"""Length of the mean direction to points that are spread evenly over one side of a straight line."""
+"""Length of the mean of unit directions that are spread evenly over one side of a straight line."""
 
 
 @njit(cache=True, nogil=True)
 def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN001, ANN201
     """(n,) bool, the points of one mask that lie behind others of it which surround them in the image.
 
-    xy: (n, 2) float64, places in the image at depth 1; area: of the mask, there. depth, weight: (n,), depths ascending.
-    gap: a step in depth wider than this parts the points about a place, if it is no less than that place is wide: so
-    deep is a slanted surface. The nearest part with front_share of their weight is the surface there. What lies behind
-    its rim is not surrounded: rims of masks, and what a depth sensor puts there, are uncertain, and other rules judge
-    of them.
+    xy: (n, 2) float64, places in an image at depth 1; area: of the mask, there. depth, weight: (n,), depths ascending.
+    gap: the points about a place are parted where depth steps by more than this and by more than that place is wide; a
+    slanted surface goes as deep as it is wide. The nearest part with front_share of their weight is the surface there.
+    What lies behind the surface's rim is not surrounded: rims of masks, and what a depth sensor puts there, are
+    uncertain, and other rules judge them.
     """
     n = len(depth)
     hidden = np.zeros(n, np.bool_)
     if n == 0 or depth[-1] - depth[0] <= gap:
         return hidden
-    # Three by three cells are the window that the points of the middle one are looked at in.
+    # The points of a cell are looked at in the window of three by three cells about it, which holds WINDOW points where
+    # they lie evenly over the mask. A mask much smaller than its bounding box gets about four cells a point at most.
     low, span = np.array([xy[:, 0].min(), xy[:, 1].min()]), np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
     cell = np.sqrt(max(area * WINDOW / 9, span[0] * span[1] / 4) / n)
     cell = max(cell, span.sum() / (4 * n), 1e-12)
@@ -40,6 +41,7 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
     for middle in range(columns * rows):
         if start[middle] == start[middle + 1]:
             continue
+        # Nothing in the cell lies a gap behind the mask's nearest point: no need to look at its window.
         deepest = depth[members[start[middle + 1] - 1]]  # members of a cell ascend
         if deepest - depth[0] <= gap:
             continue
@@ -47,12 +49,14 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
         column = middle - row * columns
         around = max(row - 1, 0), min(row + 2, rows), max(column - 1, 0), min(column + 2, columns)
         near = depth[_nearest(around, start, members, columns, n)]
+        # The window's width in scene units, at that depth.
         step = max(gap, 3 * cell * near)
         # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
         if not deepest - near > step:
             continue
         about = _about(around, start, members, columns, window)
         begin, end = _front(depth, weight, about, step, front_share)
+        # Points are numbered by depth: one from about[end] on lies behind the surface.
         for point in members[start[middle] : start[middle + 1]]:
             if end < len(about) and point >= about[end]:
                 hidden[point] = _surrounded(xy, point, about[begin:end])
@@ -61,7 +65,8 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
 
 @njit(cache=True, nogil=True)
 def _by_cell(xy, low, cell, columns, rows):  # noqa: ANN001, ANN202
-    """(start, members): the points by the cell of a grid that they lie in, row by row; of a cell, as they come."""
+    """(start, members): members[start[c] : start[c + 1]] are the points of cell c, ascending; cells go row by row."""
+    # A counting sort: how many points each cell has, hence where each begins, then every point in its cell's turn.
     place = np.empty(len(xy), np.int64)
     start = np.zeros(columns * rows + 1, np.int64)
     for i in range(len(xy)):
@@ -77,7 +82,7 @@ def _by_cell(xy, low, cell, columns, rows):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _nearest(around, start, members, columns, n):  # noqa: ANN001, ANN202
-    """The first of n points in these cells: (first row, end of rows, first column, end of columns)."""
+    """The lowest number of n points in these cells: (first row, end of rows, first column, end of columns)."""
     nearest = n
     for row in range(around[0], around[1]):
         for cell in range(row * columns + around[2], row * columns + around[3]):
@@ -91,11 +96,12 @@ def _about(around, start, members, columns, window):  # noqa: ANN001, ANN202
     """The points of these cells, ascending, written to ``window``."""
     count = 0
     for row in range(around[0], around[1]):
+        # Cells side by side in a row are one stretch of the members.
         for k in range(start[row * columns + around[2]], start[row * columns + around[3]]):
             window[count] = members[k]
             count += 1
     about = window[:count]
-    if count > 4 * WINDOW:
+    if count > 4 * WINDOW:  # insertion takes the square of their number
         about.sort()
     for k in range(1, count):  # by insertion: few points, in runs that ascend already
         point, place = about[k], k
@@ -108,8 +114,8 @@ def _about(around, start, members, columns, window):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _front(depth, weight, points, gap, front_share):  # noqa: ANN001, ANN202
-    """(begin, end) of the nearest run of points, in ascending order of depth, parted by gaps, with this share of all
-    their weight; (0, n) where there is none."""
+    """(begin, end) of the first run of points, ascending in depth and parted by gaps, that has this share of all their
+    weight; (0, n) where none before the last has."""
     least, mass, begin = 0.0, 0.0, 0
     for point in points:
         least += front_share * weight[point]
@@ -117,6 +123,7 @@ def _front(depth, weight, points, gap, front_share):  # noqa: ANN001, ANN202
         if k and depth[points[k]] - depth[points[k - 1]] > gap:
             if mass >= least:
                 return begin, k
+            # A crumb in front is no surface: begin again behind it.
             begin, mass = k, 0.0
         mass += weight[points[k]]
     return 0, len(points)
@@ -124,7 +131,7 @@ def _front(depth, weight, points, gap, front_share):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _surrounded(xy, point, others):  # noqa: ANN001, ANN202
-    """Whether the others lie about a point in the image, not all to one side of it: by the mean direction to them."""
+    """Whether the others lie all around a point in the image, not to one side of it, by the mean direction to them."""
     x, y, count = 0.0, 0.0, 0
     for other in others:
         across, down = xy[other, 0] - xy[point, 0], xy[other, 1] - xy[point, 1]

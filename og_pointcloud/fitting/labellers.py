@@ -6,8 +6,8 @@ fast      instance features from the mask table, a two-level codebook, masks mat
 paper     the same objectives as published: trained by rendering, a view a step (learned/paper.py), each instance
           matched as rendered alone. The reference of the other two.
 
-All give a `Labelling`. Grouping and fast then decide every point from all views (membership.py); the points of mode
-paper keep their leaf.
+All return a `Labelling`. In grouping and fast all views then decide every point (membership.py); in mode paper points
+keep their leaf.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Labelling:
     certainty: NDArray[np.float32] | None = None
 
     def of_points(self, rows: NDArray[np.integer] | None) -> Labelling:
-        """The labelling of points that each get what one of ``rows`` has; None: of the same points."""
+        """The labelling of other points, each as the point in its row of ``rows``; None: of the same points."""
         if rows is None:
             return self
         certainty = None if self.certainty is None else self.certainty[rows]
@@ -71,6 +71,7 @@ Labeller = Callable[[MaskTable, Surface, FitSettings, Journal], Labelling]
 def grouping(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """Masks joined by the Gaussians they share; no training."""
     with journal.stage("grouping"):
+        # Overlaps of masks are shares: a sample of the points measures them as well.
         sample = sample_of_points(surface.gaussians.xyz, settings.grouping.graph_points)
         groups = group_masks(table, settings.grouping, sample)
         votes = view_votes(table)
@@ -91,6 +92,7 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
     journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
     journal.notes["clusters"] = [len(book.coarse_centers), len(book.leaf_centers)]
     with journal.stage("matching"):
+        # A mask's P_j of Eq. 5 is the mean of what it shows, an instance's M_i its leaf's center.
         shown = mask_means(table, learned.features)
         evidence = visible_evidence(table, book.leaf, book.leaf_centers, shown)
         matching = match_masks(table, book.leaf, evidence, settings.matching)
@@ -123,7 +125,7 @@ def trained_by_rendering(
 
     options = settings.paper
     if options.k1 is None:
-        options = replace(options, k1=thing_count(table))
+        options = replace(options, k1=thing_count(table))  # before training: a checkpoint's key holds the settings
     drawn = surface.gaussians, surface.thinned_views(), surface.near, options
     with journal.bars() as report:
         run = TrainingRun(settings.seed, report, work)
@@ -131,6 +133,7 @@ def trained_by_rendering(
             source = source or RenderedViews(*drawn, whole=False)
             trained = train_features(source, options, run)
         with journal.stage("codebook"):
+            # The printed Eq. 4 compares whole images, all others pixels in masks.
             source = RenderedViews(*drawn, whole=True) if options.formula == "paper" else source
             book = train_codebook(source, trained.raw, options, run)
     journal.notes["training"] = [history.to_dict() for history in (trained.history, *book.histories)]
@@ -148,6 +151,7 @@ def leaves_of_training(
     """The leaves of a trained codebook as instances, each with the masks that Eq. 5 accepts for it."""
     options, gaussians = settings.paper, surface.gaussians
     near, views = surface.near, surface.thinned_views()
+    # Leaves with Gaussians become instances 0, 1, ...; of k1 k2 numbers some have none.
     used, leaf = np.unique(book.leaf[book.leaf >= 0], return_inverse=True)
     ids = np.full(len(gaussians), -1, np.int32)
     ids[book.leaf >= 0] = leaf
@@ -168,9 +172,9 @@ def leaves_of_training(
 
 
 LABELLERS: dict[str, Labeller] = {"grouping": grouping, "fast": fast, "paper": paper, "auto": grouping}
-"""By `FitSettings.mode`. The first is the default on every scene, and what "auto" stands for: over the zoo's half for
-choosing fast was better by more than 0.01 on one of 32 scenes, and neither agreement with masks nor reliability told
-which."""
+"""By `FitSettings.mode`. Grouping is the default on every scene, and what "auto" stands for: over the zoo's half for
+choosing, fast was better by more than 0.01 on one of 32 scenes, and neither agreement with masks nor reliability told
+which one."""
 
 
 def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -184,6 +188,7 @@ def _settled(
     matching: Matching,
 ) -> Labelling:  # fmt: skip
     """Leaves as groups of the masks that they accepted, largest first; all views then decide every point."""
+    # number[leaf] is its rank by points; the last, of leaf -1, stays -1.
     order = np.argsort(-matching.instances.points, kind="stable")
     number = np.append(np.argsort(order), -1).astype(np.int32)
     groups = MaskGroups(number[matching.mask_instance], len(order), np.zeros(len(table.mask_view), bool))
@@ -212,6 +217,7 @@ def _decided_by_views(
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
     with journal.stage("association"):
         ids = membership.instance_ids
+        # A group that was shown as two things becomes two; a group that no point is left of goes.
         looks = looks_of_groups(table, groups.group, ids, groups.count)
         used, ids, mask_instance = renumbered(by_look(votes, ids, looks), looks.look)
         instances = instances_of_groups(table, mask_instance, ids, len(used))

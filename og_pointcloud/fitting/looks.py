@@ -2,7 +2,7 @@
 
 Masks of one extent are one group, whatever the encoder says of them (grouping.py): a couch that half of the views call
 a suitcase stays whole. Its mean feature is then of neither. Where the masks of a group fall into two clearly separate
-kinds, with enough views of each, every point of the group takes the kind that more of its own votes are for.
+kinds, with enough masks of each, every point of the group takes the kind that more of its own votes are for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 
 LEAST_MASKS = 4
-"""Masks that a look has at least: fewer are apart by chance, or are wrong."""
+"""A look has at least so many masks: fewer are apart by chance, or are wrong."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,12 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
     features = directions(table.mask_features)
     described = features.any(axis=1)
     usable = (group >= 0) & (shown > 0) & described
+    # What the encoder says of different things here, so that no threshold depends on the encoder.
     cosines = cosines_of_different(features[described], table.mask_view[described])
     unlike = float(np.median(cosines)) if len(cosines) else 0.0
     look, owner = group.copy(), list(range(count))
     for index, members in enumerate(members_of(np.where(usable, group, -1), count)):
+        # Kinds are split again as long as they hold two: three things make two splits.
         waiting = [members]
         kinds: list[NDArray[np.intp]] = []
         while waiting:
@@ -53,6 +55,7 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
                 kinds.append(masks)
             else:
                 waiting += [masks[second], masks[~second]]
+        # The kind that shows most stays the group; the others get numbers of their own.
         kinds.sort(key=lambda masks: -shown[masks].sum())
         for masks in kinds[1:]:
             look[masks] = len(owner)
@@ -61,13 +64,13 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
 
 
 def by_look(votes: ViewVotes, ids: NDArray[np.int32], looks: Looks) -> NDArray[np.int32]:
-    """(n,) int32: ids, those of groups with several looks replaced by the look that most votes on the point are for
-    (ties, and points without a vote: the main look)."""
+    """(n,) int32: ids, in which points of a group with several looks have the look that most of their votes are for;
+    where votes are equal, or there are none, the main look."""
     found = ids.copy()
     several = np.unique(looks.group[np.bincount(looks.group)[looks.group] > 1])
     for group in several.tolist():
         points = np.flatnonzero(ids == group)
-        own = np.flatnonzero(looks.group == group)
+        own = np.flatnonzero(looks.group == group)  # ascending: the main look, with the group's number, is first
         shares = [
             np.asarray(csr_array(votes.in_mask[np.flatnonzero(looks.look == look)])[:, points].sum(axis=0)).ravel()
             for look in own
@@ -79,14 +82,14 @@ def by_look(votes: ViewVotes, ids: NDArray[np.int32], looks: Looks) -> NDArray[n
 def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64], unlike: float) -> NDArray[np.bool_] | None:
     """(masks,) bool, those of the second of two clearly separate kinds of masks; None, as for most, where there is one.
 
-    2-means on the sphere from the least alike pair. The kinds are separate when masks of different kinds are nearer to
-    what masks of different things are (cosine ``unlike``) than to what masks of one kind are. All by medians of pairs:
-    single masks are of other things. Fewer than LEAST_MASKS wrong masks are outliers, not a second look.
+    2-means on the sphere from the least alike pair. The kinds are separate when the cosine of masks of different kinds
+    is nearer to that of different things (``unlike``) than to that of masks of one kind. All are medians of pairs, as
+    single masks may be wrong; fewer than LEAST_MASKS wrong masks are outliers, not a second look.
     """
     if len(features) < 2 * LEAST_MASKS:
         return None
     cosines = features @ features.T
-    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]
+    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]  # the pair that is least alike
     second = features @ centres[1] > features @ centres[0]
     for _ in range(len(features)):  # settles in a few rounds
         centres = directions(np.stack([weight[~second] @ features[~second], weight[second] @ features[second]]))
@@ -95,6 +98,7 @@ def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64], unl
             break
     if min(second.sum(), (~second).sum()) < LEAST_MASKS:
         return None
+    # Halfway between one kind and different things; a third or two thirds of the way label scenes as well.
     same = second[:, None] == second
     within, across = np.median(cosines[same & ~np.eye(len(features), dtype=bool)]), np.median(cosines[~same])
     return second if across < (within + unlike) / 2 else None

@@ -127,6 +127,7 @@ def mask_table(
             seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, asked)
             return _as_arrays(seen.rows, seen.openness)
 
+        # Of a view only sizes are kept here: its entries may be held, or written to a file, by the work folder.
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
         pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
@@ -146,8 +147,9 @@ def mask_table(
 
 @dataclass(frozen=True)
 class _ShownView:
-    """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``. sizes: (3,) entries in masks, outside of
-    them, and of the exposure. pixels: (masks,) int32. name, mask_features, mask_tracks: as of `View`."""
+    """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``, or ``make`` makes anew. sizes: (3,)
+    numbers of entries: in masks, outside of them, of the exposure. pixels: (masks,) int32, area of each. name,
+    mask_features, mask_tracks: as of `View`."""
 
     name: str
     key: str
@@ -159,7 +161,7 @@ class _ShownView:
 
 
 def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
-    """Tells all that the rows of a view depend on but for the geometry. ids: its mask map."""
+    """A fingerprint of all that a view's rows depend on, but for the geometry. ids: its mask map."""
     camera = view.camera
     numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
     return fingerprint(numbers, camera.world_to_camera, ids)
@@ -176,6 +178,7 @@ def _view_arrays(
     and values, and columns and values of the view's exposure."""
     shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
     exposure = _exposure(shown)
+    # Pixels that no photograph covers say nothing: a Gaussian with its center there is unseen, not outside of masks.
     if (ids == NOT_SEEN).any():
         seen = _photographed(gaussians.xyz, view.camera, ids).astype(np.float32)
         for matrix in (shown.rows, exposure):
@@ -195,6 +198,7 @@ def _photographed(xyz: NDArray[np.float32], camera: Camera, ids: NDArray[np.int3
 
 
 def _as_arrays(rows: csr_array, exposure: csr_array) -> tuple[NDArray[Any], ...]:
+    """The arrays of a view as `_view_arrays` returns them."""
     return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
 
 
@@ -203,11 +207,12 @@ def _put_together(
 ) -> tuple[csr_array, csr_array, csr_array]:
     """(weights, outside, exposure) of all views. Each view is let go once it is copied: none is in memory twice."""
     sizes = sum((view.sizes for view in views), np.zeros(3, np.int64)).tolist()
+    # 8 bytes an entry: an int32 column and a float32 value. Sizes are known, so no array grows and moves.
     matrices = [SparseRows(entries, n, 8 * sum(sizes) > most_in_memory) for entries in sizes]
     for view in views:
         lengths, columns, values, exposed_columns, exposed_values = work.arrays("view", view.key, view.make)
         work.forget("view", view.key)
-        border = len(columns) - lengths[-1]
+        border = len(columns) - lengths[-1]  # the last row is of pixels outside of masks
         matrices[0].append(lengths[:-1], columns[:border], values[:border])
         matrices[1].append(lengths[-1:], columns[border:], values[border:])
         matrices[2].append(len(exposed_columns), exposed_columns, exposed_values)
@@ -222,14 +227,14 @@ def _stacked(features: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def stacked_tracks(of_views: Sequence[tuple[NDArray[np.integer] | None, int]]) -> NDArray[np.int64] | None:
-    """`MaskTable.mask_track` of `View.mask_tracks` and numbers of masks."""
+    """`MaskTable.mask_track`, given for each view its `View.mask_tracks` and its number of masks."""
     if all(tracks is None for tracks, _ in of_views):
         return None
     return np.concatenate([np.full(count, -1) if tracks is None else np.int64(tracks) for tracks, count in of_views])
 
 
 def require_sight(exposed: int, masked: int, scene: Scene) -> None:
-    """SceneError where no view shows a point, or no mask does; given the numbers of such entries."""
+    """SceneError where no view shows a point, or no mask does. exposed, masked: how many entries say so."""
     if exposed == 0:
         raise SceneError(
             f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
@@ -252,6 +257,7 @@ def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], coun
 
 @njit(cache=True)
 def _weights_by_instance(indptr, indices, data, instance_ids, count):  # noqa: ANN001, ANN202
+    """As above, entry by entry: a product with a sparse indicator would make a copy of the table's size."""
     rows = len(indptr) - 1
     sums = np.zeros((rows, count))
     for row in range(rows):
@@ -265,7 +271,8 @@ def _weights_by_instance(indptr, indices, data, instance_ids, count):  # noqa: A
 class SparseRows:
     """A CSR matrix (rows, width) of int32 columns and float32 values that is filled row by row.
 
-    entries: how many it will have at most. on_disk: whether they go to files, mapped, or into memory.
+    entries: how many it will have at most. on_disk: whether they go to files, mapped, or into memory. Fewer than 2^31,
+    so that int32 counts them: SciPy would turn all indices into int64, twice the memory.
     """
 
     def __init__(self, entries: int, width: int, on_disk: bool) -> None:
@@ -319,7 +326,7 @@ def _side_by_side(
         try:
             for view in coming:
                 waiting.append(pool.submit(alone, view))
-                if len(waiting) > threads:
+                if len(waiting) > threads:  # one more than are worked on, so that no thread waits for the next view
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

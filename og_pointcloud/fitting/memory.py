@@ -1,7 +1,7 @@
-"""How much memory a fit may take, and arrays that do without: on disk, mapped, where they would not fit.
+"""How much memory a fit may take, and arrays in mapped files for what would not fit.
 
-Mapped arrays are read and written like any other; the system keeps of them in memory what it can and needs no swap for
-the rest. Files without a name hold them, so that nothing is left behind however a fit ends.
+Mapped arrays are read and written like any other; the system keeps in memory what it can of them and needs no swap for
+the rest. Their files have no name, so that nothing is left behind however a fit ends.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from og_pointcloud.errors import OgPointcloudError
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 LEAST = 64 * 10**6
-"""Less memory than this is a mistyped unit."""
+"""Less memory than this is taken for a mistyped unit: importing the libraries of a fit takes more."""
 CGROUPS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
 )
-"""Limit and use of a container, version 2 and 1."""
+"""Files with a container's limit and use of memory, in bytes: of control groups version 2, and version 1."""
 
 
 def parse_memory(text: str) -> int:
     """ "4GB", "500M" or "2.5e9" in bytes (powers of 1000); OgPointcloudError for anything else, or less than 64 MB."""
+    # "GiB" is read as GB: a limit that is a little low does no harm.
     match = re.fullmatch(r"\s*([0-9.]+(?:e[0-9]+)?)\s*([KMGT]?)i?B?\s*", text, re.IGNORECASE)
     try:
         value = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
@@ -52,20 +53,21 @@ def free_memory() -> int:
 
 
 def _meminfo() -> int:
+    """Bytes that the machine could give without swapping, as far as the system tells."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration):  # no Linux: count on most of what is built in
         try:
             return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4
-        except (AttributeError, ValueError, OSError):
+        except (AttributeError, ValueError, OSError):  # Windows: a cautious guess
             return 4 * 10**9
 
 
 def memory_in_use() -> int:
     """Bytes of memory that this process holds now; 0 where the system does not tell."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE  # resident pages
     except (OSError, ValueError):
         return 0
 
@@ -80,7 +82,7 @@ def peak_memory() -> int:
 
 
 def memory_left(limit: int | None) -> int:
-    """Bytes that this process may still take: up to the limit, or without one half of what is free."""
+    """Bytes that this process may still take: up to the limit; without a limit, half of what is free."""
     return max(0, limit - memory_in_use()) if limit is not None else free_memory() // 2
 
 
@@ -108,7 +110,7 @@ def scratch_array(size: int, dtype: DTypeLike) -> NDArray[Any]:
 
 
 def _reserve(file: int, size: int) -> None:
-    """Take the room on the disk now: a mapped file that turns out to have none ends the process (SIGBUS)."""
+    """Take the room on the disk now: writing to a mapped file that has none left ends the process (SIGBUS)."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file, 0, size)
     else:

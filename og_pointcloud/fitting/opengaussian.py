@@ -1,7 +1,7 @@
 """Results of OpenGaussian runs -> LabelledCloud: ``point_cloud.ply`` with ``cluster_lang.npz``.
 
 The .ply is a trained 3DGS file (the six ``ins_feat_*`` properties that OpenGaussian adds were clustered already and are
-not read). The .npz names the outcome, one row per leaf of the two-level codebook (k1 k2 of them, many empty):
+not read). The .npz holds the outcome, one row per leaf of the two-level codebook (k1 k2 of them, many empty):
 
   ``leaf_feat``   (K, D) floats, mean CLIP feature of the leaf's masks, a zero row where no mask matched
   ``leaf_score``  (K,) floats, mean score of those matches
@@ -35,7 +35,7 @@ from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.settings import GeometrySettings
 
 MIN_OPACITY = 0.1
-"""Gaussians less opaque cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""
+"""Gaussians less opaque than this cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""
 ARRAYS = ("leaf_feat", "leaf_score", "occu_count", "leaf_ind")
 MAX_UNPACKED_BYTES = 1 << 31
 """Bytes of the four arrays together; ten million Gaussians and a thousand leaves need 82 MB."""
@@ -43,7 +43,7 @@ MAX_UNPACKED_BYTES = 1 << 31
 
 @dataclass(frozen=True)
 class _Leaves:
-    """The four arrays, checked. unit_features: (K, D) float32, unit rows, zero where the leaf has no feature."""
+    """The four arrays, checked. unit_features: (K, D) float32, unit rows, zero where no view matched the leaf."""
 
     unit_features: NDArray[np.float32]
     score: NDArray[np.float32]
@@ -66,8 +66,8 @@ def read_opengaussian(
         OpenGaussian's are, else unknown.
     min_opacity: Gaussians less opaque are left out; 0 keeps all, and with them the file's order.
 
-    Evidence: ``views`` and ``masks`` are occu_count, ``agreement`` is leaf_score; ``visible_area``, of which the files
-    say nothing, is 0. Raises SceneError, beginning with the path, for files that are missing, damaged or not of one
+    Evidence: ``views`` and ``masks`` are occu_count, ``agreement`` is leaf_score; ``visible_area`` is 0, as the files
+    say nothing about it. Raises SceneError, beginning with the path, for files that are missing, damaged or not of one
     run. Nothing is unpickled.
 
     >>> import og_pointcloud as og
@@ -88,6 +88,7 @@ def read_opengaussian(
             f"{points.opacity.max(initial=0):.3g}); expected visible ones: lower min_opacity"
         )
     xyz = points.xyz[kept]
+    # Leaves with a Gaussian that is kept become instances 0, 1, ...; k1 k2 leaves are mostly empty.
     used, ids = np.unique(leaves.of_gaussian[kept], return_inverse=True)
     settings, width = GeometrySettings(), leaves.unit_features.shape[1]
     spacing = float(np.median(neighbourhood(xyz, settings).spacing))
@@ -130,6 +131,7 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
     features, score, views, of_gaussian = (arrays[name] for name in ARRAYS)
     if features.ndim != 2 or features.dtype.kind != "f":
         raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, width)")
+    # One value a leaf, and one leaf a Gaussian: another number of Gaussians means files of two runs.
     leaves = len(features)
     for name, kinds, length in zip(ARRAYS[1:], ("fiu", "fiu", "iu"), (leaves, leaves, gaussians), strict=True):
         if arrays[name].dtype.kind not in kinds or arrays[name].shape not in ((length,), (length, 1)):
@@ -137,6 +139,7 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
                 f"{name} is {arrays[name].dtype} {arrays[name].shape}; expected "
                 f"{'numbers' if 'f' in kinds else 'integers'} of shape ({length},): give the two files of one run"
             )
+    # In float64 no bound rounds; NaN is within none.
     largest = np.finfo(np.float32).max
     bounds = (-largest, largest), (-largest, largest), (0, (1 << 31) - 1), (0, leaves - 1)
     for name, (least, most) in zip(ARRAYS, bounds, strict=True):
@@ -150,6 +153,7 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
     unit = directions(features)
     return _Leaves(
         np.where((views > 0).reshape(-1, 1), unit, 0).astype(np.float32),
+        # A score of Eq. 5 is a share; rounding may leave it just beyond.
         np.clip(score, -1, 1).astype(np.float32).reshape(-1),
         views.astype(np.int32).reshape(-1),
         of_gaussian.astype(np.int64).reshape(-1),
@@ -174,6 +178,7 @@ def _instances(leaves: _Leaves, used: NDArray[np.int64], ids: NDArray[np.intp]) 
 def _provenance(
     ply: Path, clusters: Path, leaves: _Leaves, used: NDArray[np.int64], faint: int, min_opacity: float
 ) -> dict[str, Any]:
+    """Where the cloud is from and what of it was left out, with the keys that a fit's provenance has."""
     total, count = len(leaves.views), len(used)
     undescribed = int((~leaves.unit_features[used].any(axis=1)).sum())
     left_out = []

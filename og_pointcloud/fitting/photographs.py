@@ -33,7 +33,9 @@ class Photographs:
 
     @classmethod
     def of(cls, views: Sequence[View]) -> Photographs:
-        """Those of views, in their order; a view that was not cut is a photograph."""
+        """The photographs of views, in their order; a view that was not cut is a photograph."""
+        # Keys tell a view from a photograph of the same name. Masks get a number that sorts by photograph, then by the
+        # row that the mask has there: parts of one mask have the same.
         number: dict[tuple[str, bool], int] = {}
         of_view, masks = [], []
         for view in views:
@@ -46,7 +48,7 @@ class Photographs:
         return cls(tuple(name for name, _ in number), np.array(of_view, np.int32), of_mask, first)
 
     def joined(self, table: MaskTable) -> MaskTable:
-        """The table of the views, as one of the photographs, in whose place it is: that may be written over."""
+        """The table of the views as one of the photographs. It takes their place: their entries may be overwritten."""
         if len(self.names) == len(self.of_view):
             return table
         views = self.of_view, len(self.names)
@@ -70,8 +72,9 @@ def _summed(matrix: csr_array, whole: NDArray[np.integer], count: int) -> csr_ar
     """(count, n) sparse: the sums of the rows that are parts of each whole."""
     parts = np.argsort(whole, kind="stable")
     first = np.searchsorted(whole[parts], np.arange(count + 1))
+    # In place where rows are taken in their order: what is written then never passes what is still to be read.
     columns, values = matrix.indices, matrix.data
-    if (np.diff(parts) < 0).any():  # else sums come to lie before what is still to be read
+    if (np.diff(parts) < 0).any():
         columns, values = scratch_like(columns, np.int32), scratch_like(values, np.float32)
     starts = _add_rows((matrix.indptr, matrix.indices, matrix.data), parts, first, matrix.shape[1], columns, values)
     return csr_array((values[: starts[-1]], columns[: starts[-1]], starts), shape=(count, matrix.shape[1]))
@@ -79,7 +82,8 @@ def _summed(matrix: csr_array, whole: NDArray[np.integer], count: int) -> csr_ar
 
 @njit(cache=True)
 def _add_rows(matrix, parts, first, n, columns, values):  # noqa: ANN001, ANN202
-    """Writes the entries of the sums, row by row, a column's where the first of its parts has it; where rows begin."""
+    """Writes the entries of the sums, row by row, columns as they first occur in a sum's parts. Returns where rows
+    begin."""
     indptr, indices, data = matrix
     place = np.full(n, -1, np.int64)  # of a column's entry; one before this row's begin is of an earlier row
     starts = np.zeros(len(first), np.int32)

@@ -1,19 +1,19 @@
 """How good a fit is, without truth: its split-half reliability, for each instance and for the scene.
 
-Labels are made anew from either half of the views, every other one by name, from the rows of the mask table that there
-are already. An instance is as reliable as the product of three shares in [0, 1]:
+Labels are made anew from either half of the views, every other one by name, from the rows that the mask table has
+already. The reliability of an instance is the product of three shares in [0, 1]:
 
     again   how far its points are those that a half gives its look (Dice: twice those that are both, over the sum of
             both), mean of both halves. Few views, geometry that hides the wrong things, wrong poses and masks that are
             cut otherwise in every view lower it
     named   of its masks, those whose own feature, alone, is nearest to the instance's look. An encoder that errs, and
             masks that span several things, lower it
-    kept    of the points that lie mostly in masks of it, those that it has. What all halves get wrong alike, since
-            rays slip through a surface in all views, or since masks hold more than the thing, still lowers this
+    kept    of the points that lie mostly in masks of it, those that it has. Both halves may agree on what is wrong, as
+            rays slip through a surface in all views, or masks hold more than the thing: this is lower even so
 
 Instances are of one look where their descriptors are alike once what all masks have in common is taken away: two
-chairs are, and either may be found where the other was. What all views get wrong alike no half can tell. Over
-`examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
+chairs are, and either may be found where the other was. What all views get wrong in the same way, no half can tell.
+Over `examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
 SAME_LOOK = 0.5
-"""Cosine of descriptors, without what all masks share, from which two instances are of one look. Unrelated things have
-about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
+"""Two instances are of one look from this cosine of their descriptors on, taken without what all masks share. Unrelated
+things have about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
 MOSTLY = 0.5
-"""Share of what is seen of a point from which it lies in the masks of one instance alone."""
+"""A point lies mostly in masks of an instance with more than this share of what is seen of it: of one instance only."""
 ROWS_AT_ONCE = 1 << 24
-"""Cosines held at once."""
+"""Cosines held at once: 128 MB in float64."""
 ROWS = 16
-"""Rows of a mask table looked at at once."""
+"""Rows cut out of a mask table at once: it may be mapped from a file, and larger than memory."""
 
 Bools = NDArray[np.bool_]
 
@@ -67,7 +67,7 @@ class Reliability:
 def split_half(table: MaskTable, surface: Surface, labelling: Labelling, settings: FitSettings) -> Reliability | None:
     """The reliability of a labelling; None where views cannot be halved. Does not depend on the order of views.
 
-    table, surface: what it was made from. Clouds of more than ``geometry.held_out_points`` are judged by so many.
+    table, surface: what it was made from. Of a larger cloud a sample of ``geometry.held_out_points`` points is judged.
     """
     masked = sorted(np.unique(table.mask_view).tolist(), key=lambda index: table.names[index])
     if len(masked) < FEWEST_VIEWS or not len(labelling.instances):
@@ -77,6 +77,7 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
     ids = labelling.instance_ids[sample]
     looks, count = _Looks(table, labelling.instances), len(labelling.instances)
     points = np.bincount(ids[ids >= 0], minlength=count)
+    # Halves of every other view: each then looks at the scene from all around. Either counts half.
     again, kept, unseen = np.zeros(count), np.zeros(count), np.zeros(len(ids), bool)
     for half in (masked[0::2], masked[1::2]):
         part = _of_views(table, np.sort(half), sample)
@@ -95,6 +96,7 @@ class _Looks:
     def __init__(self, table: MaskTable, instances: InstanceTable) -> None:
         features = table.unit_features
         given = features.any(axis=1)
+        # Encoders give all images of a scene much in common; what tells things apart is the rest.
         self.common = features[given].mean(axis=0, dtype=np.float64) if given.any() else np.zeros(features.shape[1])
         self.direction, self.described = self.of(instances)
         self._rows = np.flatnonzero(self.described)
@@ -109,7 +111,7 @@ class _Looks:
         return total, described
 
     def without_common(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Unit rows of what features have beyond that which all masks of the scene share."""
+        """Unit rows of what features have beyond the mean of all masks of the scene."""
         return unit_rows(unit_rows(features.astype(np.float64)) - self.common)
 
     def nearest(self, directions: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -123,6 +125,7 @@ class _Looks:
 
     def alike(self, first: NDArray[np.integer], second: NDArray[np.integer]) -> Bools:
         """Whether pairs of instances are of one look; none is like -1."""
+        # A cosine for each different pair: points are many, pairs of instances few.
         pairs, place = np.unique(np.stack([first, second]), axis=1, return_inverse=True)
         cosine = (self.direction[pairs[0]] * self.direction[pairs[1]]).sum(axis=1)
         same = ((pairs[0] == pairs[1]) | (cosine > SAME_LOOK)) & (pairs >= 0).all(axis=0)
@@ -134,8 +137,8 @@ def _again(
 ) -> NDArray[np.float64]:
     """(K,) Dice coefficient of each instance with what a half gives its look. points: (K,) how many are of it.
 
-    name: (n,) the instance that a half names each point. What it gives a look beyond those of that look counts for the
-    one it names.
+    name: (n,) the instance that a half names each point. A point that it names wrongly counts against the instance that
+    it names, and is missing from its own.
     """
     same = looks.alike(ids, name)
     beyond = np.bincount(name[~same & (name >= 0)], minlength=len(points))
@@ -145,12 +148,13 @@ def _again(
 
 def _named_by(table: MaskTable, surface: Surface, looks: _Looks, settings: FitSettings) -> NDArray[np.int64]:
     """(n,) the instance whose look is nearest to what labels made from these views alone give each point, -1 none."""
+    # By grouping, whatever the mode: it needs no training.
     try:
         found = grouping(table, surface, settings, Journal(progress=False))
     except SceneError:
         return np.full(len(surface.gaussians), -1)
     directions, described = looks.of(found.instances)
-    name = np.append(np.where(described, looks.nearest(directions), -1), -1)
+    name = np.append(np.where(described, looks.nearest(directions), -1), -1)  # the last: of points without an instance
     return name[np.maximum(found.instance_ids, -1)]
 
 
@@ -169,6 +173,7 @@ def _kept(table: MaskTable, owner: NDArray[np.int32], ids: NDArray[np.int32], co
 
     owner: (masks,) the instance of each mask, -1 none.
     """
+    # What is seen of each point in masks of each instance: sparse, as a point is in masks of few.
     by_instance = csr_array(indicator(owner, count) @ table.weights).tocoo()
     mostly = by_instance.data > MOSTLY * table.seen[by_instance.col]
     instance, point = by_instance.row[mostly], by_instance.col[mostly]
@@ -213,7 +218,8 @@ def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings)
 
 
 def likely_cause(found: Reliability) -> str:
-    """In words, why a reliability is low. Whether poses are wrong the checks of the capture say (checking/)."""
+    """In words, why a reliability is low. Wrong poses are found by the checks of the capture (checking/)."""
+    # What a half does not see it cannot label: ``again`` is then low whatever the masks.
     if found.alone > 0.25:
         return f"too few views: {found.alone:.0%} of the labelled points are seen by one half of the views alone"
     again, named = float(np.nanmean(found.again)), float(np.nanmean(found.named))

@@ -1,5 +1,5 @@
-"""Where tasks run, processes of this machine or a Dask cluster, both executors of `concurrent.futures`; what a task may
-take of the machine where it runs; and the steps of a stage as tasks."""
+"""Where tasks run (processes of this machine or a Dask cluster, both executors of `concurrent.futures`), what a task
+may take of the machine where it runs, and the steps of a stage as tasks."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 SHARE_OF_LIMIT = 0.6
-"""Of the memory that a Dask worker may hold, what its tasks take: at 0.8 it would be paused, at 0.95 killed."""
+"""Share of a Dask worker's memory limit that its tasks take: at 0.8 Dask pauses the worker, at 0.95 it kills it."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 LEAST_BYTES = 10**9
-"""Memory that a worker of this machine has at least, if need be by fewer of them."""
+"""A worker of this machine has at least this much memory; where there is not enough, there are fewer workers."""
 PATIENCE_S = 20
+"""How long a scheduler may take to answer, seconds."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What a task may take. threads: None for as many as there are; memory: bytes, None for what the fit decides."""
+    """What a task may take. threads: None for as many as there are. memory: bytes; None: what the fit decides."""
 
     threads: int | None = None
     memory: int | None = None
@@ -49,8 +50,9 @@ def cores_here() -> int:
 
 
 def share_here(otherwise: Share) -> Share:
-    """What a task may take where it runs: in a Dask worker one thread, and of the worker's memory what is left for each
+    """What a task may take where it runs: in a Dask worker one thread, and the same part of the worker's memory as each
     of its threads; elsewhere what it was given."""
+    # A process that has not imported distributed is no Dask worker; importing it takes long.
     if "distributed" not in sys.modules:
         return otherwise
     from distributed import get_worker
@@ -72,20 +74,22 @@ def run_tasks(
     futures = [executor.submit(_with_share, function, item) for item in items]
     try:
         return [future.result() for future in journal.steps(futures, name)]
-    except BaseException:
+    except BaseException:  # Ctrl-C too: what has not begun shall not begin
         for future in futures:
             future.cancel()
         raise
 
 
 def _with_share(function: Callable[[Item], Result], item: Item) -> Result:
+    """The function's value, on as many threads as the task may take where it runs."""
     if (threads := share_here(Share()).threads) is not None:
         use_threads(threads)
     return function(item)
 
 
 def _end_with_parent() -> None:
-    """A process whose parent was killed would wait for tasks for good: it ends, and so do its locks."""
+    """Started in each worker: it ends when its parent was killed, and with it its locks. Else it would wait for tasks
+    for good."""
 
     def watch() -> None:
         if (parent := parent_process()) is not None:
@@ -96,10 +100,11 @@ def _end_with_parent() -> None:
 
 
 class LocalWorkers(ThreadPoolExecutor):
-    """Processes of this machine, each with its share of cores and memory, and a thread that waits for what it does.
+    """Processes of this machine, each with its share of cores and memory, and a thread here that waits for each.
 
-    Each has one task at a time: where one dies (killed, out of memory, a crash in a library), that task fails with
-    BrokenProcessPool, the others go on, and the next has a new process.
+    A process has one task at a time: where one dies (killed, out of memory, a crash in a library), that task fails with
+    BrokenProcessPool, the others go on, and the thread's next task gets a new process. One pool of several processes
+    would fail all of its tasks.
     """
 
     def __init__(self, tasks: int) -> None:
@@ -108,7 +113,7 @@ class LocalWorkers(ThreadPoolExecutor):
         super().__init__(workers)
         self.share, self._process_of = Share.of_machine(workers), threading.local()
         self._before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-        # Read when a library starts, which may be before a task could say so: hence inherited.
+        # Libraries read these as they are imported, before a task could set them: so processes inherit them.
         os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(self.share.threads)))
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:

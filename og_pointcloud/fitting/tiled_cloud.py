@@ -19,9 +19,10 @@ from og_pointcloud.scene import Points
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
 MARGIN = 32.0
-"""How far a tile looks over its borders, in spacings of its sparser points: what decides a point lies nearer."""
+"""How far a tile looks over its borders, in spacings of its sparser points: all that decides about a point lies nearer.
+"""
 PROBES = 2_000
-"""Points of a tile that are asked for their spacing before its margin is known."""
+"""About how many points of a tile tell its spacing, from which its margin is computed."""
 
 Rows = NDArray[np.integer]
 
@@ -44,18 +45,19 @@ class Tiles:
 def split(xyz: NDArray[np.float32], most: int) -> Tiles:
     """As few tiles of equally many points as hold at most ``most`` each, where points do not coincide.
 
-    What holds more is cut across its longer side (that of the middle 90 % of its points: strays are no extent), so
-    that tiles are compact, small where points are dense, and never empty.
+    A part with more is cut across its longest side, measured by the middle 90 % of its points as strays are no extent.
+    So tiles are compact, small where points are dense, and never empty.
     """
     leaves: list[Rows] = []
 
     def cut(rows: Rows, count: int) -> None:
+        """Cut rows into ``count`` tiles, by halves of that number; a part without extent stays one, however large."""
         low, high = np.quantile(xyz[rows], [0.05, 0.95], axis=0) if count > 1 else (np.zeros(0), np.zeros(0))
         for axis in np.argsort(low - high, kind="stable"):
             along = xyz[rows, axis]
             place = len(rows) * (count // 2) // count
             before = along < np.partition(along, place)[place]
-            if before.any():
+            if before.any():  # else so many points share the lowest coordinate: try a shorter side
                 cut(rows[before], count // 2)
                 cut(rows[~before], count - count // 2)
                 return
@@ -68,9 +70,9 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 class TiledCloud:
     """A cloud in the order of its tiles, read-only. Made by `TiledCloud.cut`.
 
-    points, spacing (n,): the latter once ``spacing`` of the key is in the work folder. members: per tile, its points
-    and those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths. key: fingerprint of
-    points, tiles and settings. work: where all of it is, for other processes too.
+    points, spacing (n,): spacing only once a stage has put it into the work folder. members: per tile, its points and
+    those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths in the scene's unit. key:
+    fingerprint of points, tiles and settings. work: where all of it is, for other processes too.
     """
 
     def __init__(self, work: WorkFolder, key: str) -> None:
@@ -90,6 +92,7 @@ class TiledCloud:
             parts = [tiles.part(tile) for tile in range(len(tiles))]
             margins = [MARGIN * _sparse_spacing(ordered.xyz[part]) for part in parts]
             members = [_within(ordered.xyz, part, margin) for part, margin in zip(parts, margins, strict=True)]
+            # A file holds a flat list of arrays: members of all tiles in one, colors empty where there are none.
             ends, shape = np.cumsum([0, *map(len, members)]), (ordered.scale, ordered.rotation, ordered.opacity)
             known = [array for array in shape if array is not None]
             rgb = np.zeros((0, 3), np.uint8) if ordered.rgb is None else ordered.rgb
@@ -100,6 +103,7 @@ class TiledCloud:
         return cls(work, key)
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as a folder and a key: a task carries no points, its worker maps them."""
         return _opened, (self.work.place(), self.key)
 
     def __len__(self) -> int:
@@ -107,11 +111,11 @@ class TiledCloud:
 
     @cached_property
     def spacing(self) -> NDArray[np.float32]:
-        """(n,) as of `Neighbourhood`."""
+        """(n,) float32, as `Neighbourhood.spacing`."""
         return self.work.array("spacing", self.key, vanished)
 
     def inner(self, tile: int) -> slice:
-        """A tile's points without those of its margin, among its members."""
+        """Which of a tile's members are its own points and not of its margin: these lie in one stretch."""
         part = self.tiles.part(tile)
         first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
         return slice(int(first), int(last))
@@ -128,7 +132,7 @@ class TiledCloud:
 
 @lru_cache(maxsize=1)
 def _opened(folder: Path, key: str) -> TiledCloud:
-    """In another process: one for all its tasks, so that each file is checked once."""
+    """In another process: one cloud for all of its tasks, so that each file's checksum is read once."""
     return TiledCloud(WorkFolder(folder), key)
 
 
@@ -141,7 +145,8 @@ def vanished() -> NoReturn:
 
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
-    """The spacing that 95 % of the points do not exceed, by some of them."""
+    """The spacing that 95 % of the points do not exceed, by a sample of them."""
+    # Built fast rather than asked fast: few points are looked up. The first neighbour is the point itself.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(xyz[:: 1 + len(xyz) // PROBES], k=[2, 3, 4])
     known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points

@@ -67,7 +67,7 @@ def view_votes(table: MaskTable) -> ViewVotes:
 
 @njit(cache=True)
 def _relative_exposure(index, exposure, n, vote):  # noqa: ANN001, ANN202
-    """Write to ``vote`` each exposure as a part of the point's best one, to the power above; the best ones."""
+    """Write to ``vote`` each exposure as a part of the point's best one, to OPENNESS_POWER. Returns the best, (n,)."""
     best = np.zeros(n, np.float32)
     for e in range(len(index)):
         best[index[e]] = max(best[index[e]], exposure[e])
@@ -96,5 +96,6 @@ def _share_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN0
             g = vote_index[e]
             factor[g] = vote[e] / seen[g]
             seen[g] = 0.0
+        # Whatever a mask shows its view has exposed: each factor read here was written just above.
         for e in range(first, last):
             in_mask[e] = weight[e] * factor[weight_index[e]]

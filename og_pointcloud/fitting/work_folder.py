@@ -2,7 +2,7 @@
 
 One file for each unit of work (a view, a tile, a stage of training), named by what it is and by a fingerprint of all
 that it depends on: a file that is there is the answer, whichever run wrote it. Files are written whole or not at all
-and end in a checksum; one that is damaged is made anew. Nothing else is stored, and nothing needs to be in order.
+and end in a checksum; one that is damaged is made anew. There is no index beside them, and their order has no meaning.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ from og_pointcloud.formats.atomic import locked, replacing
 SUFFIX = ".kept.npy"
 """Ends the names of all files of a work folder, so that files of others are left alone."""
 ALIGNED = 64
-"""Arrays begin at multiples of so many bytes of a file."""
+"""Arrays begin at multiples of so many bytes of a file. A .npy header is padded to the same, so that the numbers are
+aligned too."""
 BLOCK = 1 << 25
-"""Bytes of memory that arrays which are held are packed into: the system's own, however many of them there are."""
+"""Bytes of the blocks that held arrays are packed into: so large that the system gets each back when it is freed."""
 
 Arrays = tuple[NDArray[Any], ...]
 
 
 def fingerprint(*parts: Any) -> str:
-    """24 hexadecimal digits that tell values apart: arrays by their bytes, all else (None too) by how it is written.
-    Other code gives others: after an upgrade nothing is taken up that an older version laid out."""
+    """24 hexadecimal digits that tell values apart: arrays by their bytes, all else (None too) by its repr. Another
+    version of the code gives other digits, so that what an older one wrote is not taken up after an upgrade."""
     digest = _of_code().copy()
     for part in parts:
         if isinstance(part, np.ndarray):
@@ -54,7 +55,7 @@ def fingerprint(*parts: Any) -> str:
 
 @lru_cache(maxsize=1)
 def _of_code() -> blake2b:
-    """Begun with the source of all that makes what is kept."""
+    """A digest begun with the source of all code that makes what is kept."""
     digest, package = blake2b(digest_size=12), Path(__file__).parents[1]
     for file in sorted([*package.glob("fitting/**/*.py"), *package.glob("rendering/*.py")]):
         digest.update(file.read_bytes())
@@ -62,7 +63,7 @@ def _of_code() -> blake2b:
 
 
 def kept_files(folder: Path, name: str = "") -> int:
-    """How many files a run that did not end has left in its work folder, of those whose names begin with ``name``."""
+    """How many files an unfinished run has left in its work folder, of those whose names begin with ``name``."""
     return len(list(folder.glob(f"{name}*{SUFFIX}")))
 
 
@@ -74,11 +75,12 @@ class WorkFolder:
 
     def __init__(self, folder: Path | None) -> None:
         self.folder, self.found = folder, 0
-        self._temporary: Path | None = None
+        self._temporary: Path | None = None  # made when a file is first written
+        # Arrays held in memory, by the name of their file; None from when all is written at once.
         self._pending: dict[str, Arrays] | None = None
         self._bytes_pending, self._most_pending, self._pending_until = 0, 0.0, 0.0
-        self._sound: set[str] = set()
-        self._room = np.empty(0, np.uint8)
+        self._sound: set[str] = set()  # files written or checked by this run: their checksum is not read again
+        self._room = np.empty(0, np.uint8)  # what is left of the block that arrays are packed into
         self._guard = threading.Lock()
 
     @classmethod
@@ -87,9 +89,10 @@ class WorkFolder:
         """For one run, which owns the folder meanwhile: another process that opens it gets an error.
 
         A run that ends well removes its files, and the folder if nothing else is in it; one that is interrupted leaves
-        them. folder None: a temporary one, made when it is needed, which goes in any case.
+        them. folder None: a temporary one, made when it is needed and removed in any case.
         """
         work = cls(None if folder is None else Path(folder))
+        # Parents that do not exist yet are of our making, and go again with the folder.
         new = [] if work.folder is None else [path for path in work.folder.parents if not path.exists()]
         try:
             with nullcontext() if work.folder is None else locked(work.folder):
@@ -106,7 +109,7 @@ class WorkFolder:
                         path.rmdir()  # fails where there is more in it
 
     def adopt(self, name: str, key: str) -> None:
-        """Take a file that another process of this run has written for sound, and not for one of an earlier run."""
+        """Trust a file that another process of this run has written: it is neither checked nor counted as found."""
         self._sound.add(f"{name}-{key}{SUFFIX}")
 
     def has(self, name: str, key: str) -> bool:
@@ -114,8 +117,8 @@ class WorkFolder:
         return (self.place() / f"{name}-{key}{SUFFIX}").exists()
 
     def hold(self, nbytes: float, seconds: float) -> None:
-        """Write no file until arrays of more than so many bytes are held, or until so many seconds have passed: what
-        is done by then is soon made again. The time counts only where the folder outlives the run."""
+        """Write no file until arrays of more than ``nbytes`` are held, or ``seconds`` have passed: what a killed run
+        loses is then made again as soon. The time counts only where the folder outlives the run."""
         self._pending, self._bytes_pending, self._most_pending = {}, 0, nbytes
         self._pending_until = time.monotonic() + seconds if self.folder is not None else np.inf
 
@@ -141,7 +144,7 @@ class WorkFolder:
     def replace(self, name: str, key: str, arrays: Sequence[NDArray[Any]]) -> None:
         """From now on `arrays` gives these: a checkpoint of work that goes on. They must not change afterwards.
 
-        Let go of what `arrays` gave before: Windows does not replace a file that is mapped.
+        What `arrays` gave before must be let go of first: Windows does not replace a file that is mapped.
         """
         self._keep(f"{name}-{key}{SUFFIX}", tuple(arrays))
 
@@ -149,6 +152,7 @@ class WorkFolder:
         """Hold the arrays, or write them and those held before; returns them as they are held."""
         with self._guard:
             if self._pending is not None:
+                # A checkpoint takes the place of the one before.
                 self._bytes_pending -= sum(array.nbytes for array in self._pending.get(label, ()))
                 self._pending[label] = arrays = tuple(map(self._packed, arrays))
                 self._bytes_pending += sum(array.nbytes for array in arrays)
@@ -161,10 +165,10 @@ class WorkFolder:
         return arrays
 
     def _packed(self, array: NDArray[Any]) -> NDArray[Any]:
-        """A copy in a block of memory that goes back to the system once all arrays in it are let go: pieces of the heap
-        would not, and a table put together from such pieces would be in memory twice."""
+        """A copy in a block of memory that goes back to the system once all arrays in it are let go. Small pieces of
+        the heap do not go back, and a table put together from such pieces would be in memory twice."""
         if array.nbytes > len(self._room):
-            self._room = np.empty(max(BLOCK, array.nbytes), np.uint8)
+            self._room = np.empty(max(BLOCK, array.nbytes), np.uint8)  # arrays packed before keep the old block alive
         copy = self._room[: array.nbytes].view(array.dtype).reshape(array.shape)
         self._room = self._room[array.nbytes + -array.nbytes % ALIGNED :]
         copy[...] = array
@@ -176,7 +180,7 @@ class WorkFolder:
             if self._pending:
                 self._pending.pop(f"{name}-{key}{SUFFIX}", None)
             if not self._pending:
-                self._room = np.empty(0, np.uint8)
+                self._room = np.empty(0, np.uint8)  # else the last block would stay
 
     def place(self) -> Path:
         """The folder itself, also where it is a temporary one."""
@@ -189,7 +193,8 @@ class WorkFolder:
     def _write(self, label: str, arrays: Arrays) -> None:
         path = self.place() / label
         try:
-            with replacing(path, durable=False) as file:  # a checksum ends it
+            # Not synced to the disk, which takes long: after a power cut the checksum tells what is damaged.
+            with replacing(path, durable=False) as file:
                 _write_arrays(file, arrays)
         except OSError as error:
             size = sum(array.nbytes for array in arrays) / 1e6
@@ -235,8 +240,8 @@ def _write_arrays(file: IO[bytes], arrays: Arrays) -> None:
 
 
 def _read_arrays(path: Path, is_sound: bool) -> Arrays | None:
-    """What `_write_arrays` wrote, mapped. They share one map, of which a process has only so many. None where the
-    checksum is another, unless the file is known to be sound."""
+    """What `_write_arrays` wrote, mapped; None where the checksum is another, unless the file is known to be sound. One
+    map for all arrays of a file: a process may have only so many maps."""
     with path.open("rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         end = len(content) - 4

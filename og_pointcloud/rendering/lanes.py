@@ -17,7 +17,8 @@ from numba import extending
 from numba.core import types
 from numba.extending import models, overload, register_model
 
-intrinsic: Any = extending.intrinsic  # whose functions are called without the context that they are written with
+# Functions made by it are called without their first parameter, the context, which type checkers cannot know: Any.
+intrinsic: Any = extending.intrinsic
 
 WIDTH = 16
 """Numbers in one value."""
@@ -25,7 +26,7 @@ WIDTH = 16
 FLOAT, INT, BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
 FLOATS, INTS, BOOLS = (ir.VectorType(kind, WIDTH) for kind in (FLOAT, INT, BOOL))
 EXP2_TERMS = np.polynomial.Chebyshev.interpolate(np.exp2, 5, [-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
-"""2^f on [-1/2, 1/2], to the precision of float32."""
+"""Coefficients of a polynomial in f, constant first, that is 2^f on [-1/2, 1/2] to the precision of float32."""
 
 
 class Lanes(types.Type):
@@ -46,6 +47,8 @@ LANES, TRUTHS = Lanes(), Truths()
 
 
 def _register(kind: type[types.Type], vector: ir.VectorType) -> None:
+    """Tell numba that values of a type are LLVM vectors, held in registers."""
+
     class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, of: Any) -> None:
             super().__init__(manager, of, vector)
@@ -73,7 +76,7 @@ def _operator(
     def of(left, right):  # noqa: ANN001, ANN202
         if left is operands and right is operands:
             return lambda left, right: apply(left, right)
-        return None
+        return None  # of other types: numba's own operator
 
 
 _operator(operator.add, LANES, LANES, "fadd")
@@ -86,10 +89,12 @@ _operator(operator.and_, TRUTHS, TRUTHS, "and_")
 
 
 def _all(value: float, vector: ir.VectorType = FLOATS) -> ir.Constant:
+    """A constant with one value in every lane; floats are rounded to float32."""
     return ir.Constant(vector, [float(np.float32(value)) if vector is FLOATS else value] * WIDTH)
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    """Where WIDTH elements of an array begin, as a pointer to a vector."""
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), FLOATS.as_pointer())
 
@@ -99,6 +104,7 @@ def spread(context: Any, number: Any) -> Any:
     """Lanes that all hold one float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # LLVM's idiom for a broadcast: put into the first lane, then every lane takes lane 0.
         undefined = ir.Constant(FLOATS, ir.Undefined)
         first = builder.insert_element(undefined, arguments[0], ir.Constant(INT, 0))
         return builder.shuffle_vector(first, undefined, _all(0, INTS))
@@ -121,6 +127,7 @@ def load(context: Any, array: Any, index: Any) -> Any:
     """Lanes from WIDTH elements of a float32 array, the first of them at ``index``, which nothing checks."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # Arrays are aligned to their float32 elements, not to whole vectors.
         return builder.load(_address(context, builder, signature.args[0], *arguments), align=4)
 
     return LANES(array, types.intp), generate
@@ -182,6 +189,7 @@ def exp2(context: Any, lanes: Any) -> Any:
         # In pairs: three short chains of operations instead of a long one (Estrin's scheme).
         value = builder.fadd(pairs[1], builder.fmul(square, pairs[2]))
         value = builder.fadd(pairs[0], builder.fmul(square, value))
+        # 2^i as float32: its biased exponent, i + 127, above the 23 bits of the fraction.
         exponent = builder.shl(builder.add(whole, _all(127, INTS)), _all(23, INTS))
         return builder.fmul(value, builder.bitcast(exponent, FLOATS))
 

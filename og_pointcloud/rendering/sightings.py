@@ -7,8 +7,8 @@ edges, smaller ones let the background through. Here the size of a point serves 
     openness_g = product of (1 - alpha_h) at the pixel of g, over all h that lie more than ``thickness`` before g
 
 with alpha_h as in 3DGS. The point's vote goes to the mask at its pixel, by its openness; half of it to those around the
-pixel, since the edges of masks are uncertain by a pixel or two. Points within ``thickness`` of
-each other along a ray never hide each other, so noisy surfaces of several layers are seen whole.
+pixel, since the edges of masks are uncertain by a pixel or two. Points within ``thickness`` of each other along a ray
+never hide each other, so noisy surfaces of several layers are seen whole.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from og_pointcloud.rendering.splatting import (
 from og_pointcloud.scene import NOT_SEEN, Camera
 
 LEAST_OPEN = 0.02
-"""A point that less light reaches is hidden: what so few rays say is as often an edge's as its own."""
+"""A point that less light reaches is hidden: what so few rays say is as often about an edge as about the point."""
 EDGE_PX = 1.5
 """Edges of masks are uncertain by so many pixels: RING_SHARE of a vote goes to a ring so far around the pixel."""
 RING_SHARE = 0.5
@@ -43,9 +43,9 @@ RING = [(EDGE_PX * np.cos(angle), EDGE_PX * np.sin(angle)) for angle in np.arang
 SAMPLES = np.array([(0.0, 0.0, 1 - RING_SHARE), *((x, y, RING_SHARE / len(RING)) for x, y in RING)])
 """Right and down of a point, in pixels, and the share of its vote there."""
 REACH_PX = int(np.ceil(EDGE_PX))
-"""A sample lies in a pixel at most so far from the point's own."""
+"""A sample lies in a pixel at most this far from the point's own."""
 BLOCK = 8
-"""Pixels along the side of a block that lies within one mask as a whole, or is looked at point by point."""
+"""Pixels along the side of a block. Amid one mask a point's vote is taken as a whole, elsewhere sample by sample."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,7 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
     (splats, starts, members, columns), (open_, u, v) = binned, seen
     tiles = len(starts) - 1
     first, points = _centres(splats, size, columns, tiles, asked)
+    # A worker takes every so-many-th tile. light: the transmittance of the tile's pixels so far, row by row.
     for worker in prange(workers):
         light, batch = tile_buffer(), np.empty(BATCH, SPLAT)
         for tile in range(worker, tiles, workers):
@@ -127,6 +128,7 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
             light[:] = np.float32(1)
             drawn = fetched = starts[tile]
             for q in range(len(of_tile)):
+                # Draw on until the next splat is no longer in front of this point's surface.
                 while drawn < starts[tile + 1]:
                     if drawn == fetched:  # they lie all over memory: fetched at once, they do not wait for each other
                         fetched = min(drawn + BATCH, starts[tile + 1])
@@ -146,6 +148,7 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
 def _centres(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
     """(first, rows): of splats whose points are asked, those with their centre in tile t are rows[first[t] :
     first[t + 1]], by the depth of their surface."""
+    # Positive floats sort as their bits do: depths are sorted by digits, all tiles at once.
     tile_of, keys = np.empty(len(splats), np.int32), np.full(len(splats), CULLED)
     first = np.zeros(tiles + 1, np.int64)
     for i in range(len(splats)):
@@ -155,6 +158,7 @@ def _centres(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
             keys[i] = np.float32(max(s.surface, 0)).view(np.uint32)  # nothing is drawn before a depth of 0
             first[tile_of[i] + 1] += 1
     first = np.cumsum(first)
+    # Dealt out in order of depth, the points of each tile are in order of depth.
     fill, rows = first[:-1].copy(), np.empty(first[-1], np.int32)
     for i in ascending(keys):
         rows[fill[tile_of[i]]] = i
@@ -168,6 +172,7 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
     rows (masks + 1, n); and the points that have a vote."""
     height, width = ids.shape
     inside = _within_masks(ids)
+    # A point has at most one entry for each sample: room for all of them, as rows, columns and votes.
     most = np.count_nonzero(open_)
     seen = np.empty(most, np.int32)
     entries = np.empty((3, most * len(samples)), np.int32)
@@ -183,12 +188,14 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
             continue
         seen[points] = g
         points += 1
+        # Amid a mask, or far from any, all samples say the same.
         if inside[row // BLOCK, column // BLOCK]:
             mask = ids[row, column] if ids[row, column] >= 0 else mask_count
             rows[end], columns[end], votes[end] = mask, g, _whole_vote(open_[g], samples)
             starts[mask + 1] += 1
             end += 1
             continue
+        # Samples in the same mask add up to one entry. Beyond the image they are those of its border.
         first = end
         for k in range(len(samples)):
             x = min(max(int(np.floor(u[g] + samples[k, 0])), 0), width - 1)
@@ -203,7 +210,7 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
                 starts[mask + 1] += 1
                 end += 1
             votes[entry] += open_[g] * samples[k, 2]
-    # By row, points of a row in their order.
+    # A counting sort by row: points of a row stay in their order.
     starts = np.cumsum(starts).astype(np.int32)
     place = starts[:-1].copy()
     sorted_columns, sorted_votes = np.empty(end, np.int32), np.empty(end, np.float32)
@@ -227,6 +234,7 @@ def _within_masks(ids):  # noqa: ANN001, ANN202
     """(blocks, blocks) bool: the blocks of pixels about which there is one mask, or none, as far as any sample of a
     point in them."""
     height, width = ids.shape
+    # A block, widened by REACH_PX: all pixels that a sample of its points may lie in. -1 and NOT_SEEN are both no mask.
     one = np.ones((-(-height // BLOCK), -(-width // BLOCK)), np.bool_)
     for row in range(one.shape[0]):
         for column in range(one.shape[1]):
