@@ -33,12 +33,13 @@ scene, splats = og.load(arguments.scene), og.read_points(arguments.splats)
 selection = og.select(scene, arguments.word)
 print(selection)
 
-# What the word means turns red, all else fades to light grey.
+# Each Gaussian takes the instance of the nearest point; what the word means turns red, all else fades to light gray.
 found = np.isin(scene.instances_at(splats.xyz_world), selection.instances)
 rgb = np.asarray(splats.rgb, np.float32)
 pale = 150 + 0.35 * (rgb @ LUMINANCE)[:, None].repeat(3, axis=1)
 colors = np.where(found[:, None], 0.4 * rgb + 0.6 * np.array([230, 40, 60]), pale).astype(np.float32)
 
+# Splats have coordinates about an origin of their own: the camera is moved there. Uncovered pixels become white.
 view = Viewpoint(arguments.eye, arguments.target, np.array([0.0, 0, 1]))
 camera = og.in_world(view.camera(640, 480, 420), -splats.origin)
 image, covered = render(Gaussians.from_points(splats), colors, camera, near=0.1)

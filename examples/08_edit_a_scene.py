@@ -33,6 +33,7 @@ files = before, removed, recoloured, inserted = [out / f"{n}.ply" for n in ("bef
 gaussians = replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
 write_ply(before, {"vertex": gaussian_rows(gaussians)})
 
+# Each edit reads a file and writes the next. halo: points without an instance this near go along with what is removed.
 sofas, cushions = og.select(scene, "sofa").instances, og.select(scene, "cushion").instances
 og.edit.remove(scene, [*sofas, *cushions], removed, cloud=before, halo=3)
 tables = og.edit.recolour(scene, "table", recoloured, (170, 40, 35), cloud=removed).instances
@@ -43,6 +44,7 @@ pose[:2, :2] = [[0, -1], [1, 0]]
 pose[:2, 3] = sofa - pose[:2, :2] @ chair
 og.edit.insert(recoloured, out / "chair.ply", inserted, pose)
 
+# The four files from one viewpoint, across the table towards where the sofa was.
 eye = np.append(table + 1.6 * (table - sofa) / np.linalg.norm(table - sofa), 2.2)
 camera = Viewpoint(eye, np.append(sofa, 0.4), np.array([0.0, 0, 1])).camera(640, 480, 420)
 pictures = []

@@ -67,7 +67,7 @@ def name_of(entry: MapObject) -> str:
     return NAMES[int((days.model.texts @ np.asarray(entry.descriptor)).argmax())]
 
 
-# Monday: frame by frame; four pictures on the way.
+# Monday: the map grows frame by frame; four pictures on the way.
 mapper, strip, moments = og.Mapper(feature_space=days.feature_space), [], []
 quarters = {round(len(days.before) * share) - 1 for share in (0.1, 0.3, 0.6, 1.0)}
 for number, frame in enumerate(days.before):
@@ -79,7 +79,7 @@ for number, frame in enumerate(days.before):
                     FONT, 0.55, (60, 60, 60), 1, cv2.LINE_AA)  # fmt: skip
 cv2.imwrite(str(out / "growing.png"), np.hstack(strip)[:, :, ::-1])
 
-# Tuesday: the same mapper goes on.
+# Tuesday: the same mapper goes on; each frame returns what it found changed, and objects keep their ids.
 monday, before = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
 changes = [mapper.integrate(frame) for frame in days.after]
 tuesday, after = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
@@ -88,22 +88,23 @@ gone = [k for k, entry in after.items() if entry.state == "gone" and k in before
 tuesday_s = days.after[0].stamp or 0.0
 new = [k for k, entry in after.items() if k not in before and tuesday_s <= entry.since < np.inf]
 
-left, after_ids = drawn(monday, tinted(monday, gone, COLORS["gone"])), tinted(tuesday, new, COLORS["new"])
+# Left what is gone, as Monday saw it; right what is new or was moved, as Tuesday sees it.
+left = drawn(monday, tinted(monday, gone, COLORS["gone"]))
 is_moved = np.isin(tuesday.instance_ids, [*moved])
-right_ = drawn(tuesday, np.where(is_moved[:, None], COLORS["moved"], after_ids))
+right = drawn(tuesday, np.where(is_moved[:, None], COLORS["moved"], tinted(tuesday, new, COLORS["new"])))
 for k in gone:
     written(left, f"{name_of(before[k])} gone", before[k], COLORS["gone"])
 for k in new:
-    written(right_, f"{name_of(after[k])} new", after[k], COLORS["new"])
+    written(right, f"{name_of(after[k])} new", after[k], COLORS["new"])
 for k, entry in moved.items():
     ends, _ = camera.project(np.array([entry.before, after[k].place]))
     for thickness, shade in ((7, (255, 255, 255)), (3, COLORS["moved"])):
         start, end = (tuple(map(round, point)) for point in ends.tolist())
-        cv2.arrowedLine(right_, start, end, shade, thickness, cv2.LINE_AA, tipLength=0.1)
-    written(right_, f"{name_of(after[k])} moved", after[k], COLORS["moved"])
-for image, day in ((left, "Monday"), (right_, "Tuesday")):
+        cv2.arrowedLine(right, start, end, shade, thickness, cv2.LINE_AA, tipLength=0.1)
+    written(right, f"{name_of(after[k])} moved", after[k], COLORS["moved"])
+for image, day in ((left, "Monday"), (right, "Tuesday")):
     cv2.putText(image, day, (16, 34), FONT, 0.9, (40, 40, 40), 2, cv2.LINE_AA)
-cv2.imwrite(str(out / "changes.png"), np.hstack([left, right_])[:, :, ::-1])
+cv2.imwrite(str(out / "changes.png"), np.hstack([left, right])[:, :, ::-1])
 mapper.save(out / "room.ogpc")
 print(f"gone: {[name_of(before[k]) for k in gone]}, new: {[name_of(after[k]) for k in new]}, "
       f"moved: {[name_of(after[k]) for k in moved]}; truth: {days.changed}")  # fmt: skip

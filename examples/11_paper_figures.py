@@ -36,7 +36,7 @@ out.mkdir(parents=True, exist_ok=True)
 scene = og.read_capture(arguments.capture)
 words, _ = og.read_text_features(arguments.capture / "text_features.npz")
 
-# Mode paper: the training that the fit leaves in the work folder is read back for its features.
+# Mode paper: a fit returns no features. Training again with the same work folder finds the checkpoint of the last step.
 settings = FitSettings(mode="paper", paper=PaperSettings(schedule_share=arguments.share))
 journal = Journal(progress=True)
 prepared = prepare(scene, settings, journal)
@@ -51,6 +51,7 @@ xyz, shown = surface.scene.points.xyz, book.leaf >= 0
 of_scene = surface.of_points(features), surface.of_points(shown)
 instance = clouds["default"].instance_ids
 known = of_scene[1] & (instance >= 0)
+# The last row stays NaN, which is drawn as nothing: for points without an instance.
 means = np.full((instance.max(initial=0) + 2, features.shape[1]), np.nan, np.float32)
 for number in np.unique(instance[known]):
     means[number] = of_scene[0][known & (instance == number)].mean(axis=0)
@@ -79,6 +80,7 @@ if best is None:
 origin = scene.points.origin
 thing = og.pick(clouds["default"], clouds["default"].xyz_world[instance == best.instance][0])
 masks = [thing.mask(og.in_world(view.camera, origin)) for view in scene.views]
+# A view that cuts the thing off at its border counts a tenth of its pixels.
 cut = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any() for mask in masks]
 most = int(np.argmax([mask.sum() * (0.1 if off else 1) for mask, off in zip(masks, cut, strict=True)]))
 inner = cv2.distanceTransform(np.pad(masks[most], 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]

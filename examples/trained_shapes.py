@@ -123,7 +123,7 @@ def _add_gradient(sparse, pixels, width, values, pull, splats, opacity, found): 
         behind = 0.0  # pull on all that lies behind the entry
         for e in entries:
             behind += weights[e] * (pull[row] * values[indices[e]]).sum()
-        light = 1.0
+        light = 1.0  # T of the entry: what those before it let through
         for e in entries:
             g, weight = indices[e], np.float64(weights[e])
             own = (pull[row] * values[g]).sum()

@@ -152,6 +152,7 @@ def walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArra
     start = rng.uniform(0, 2 * np.pi)
     poses = []
     for step in range(views):
+        # progress: 0 to 1 in the first round, 1 to 2 in the second.
         progress = 2 * step / views
         outwards = progress >= 1
         angle = start + 2 * np.pi * progress
@@ -164,7 +165,7 @@ def walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArra
             eye = np.array([*(0.66 * half * around), 1.45 + lift])
             target = np.array([*(-0.3 * half * around), 0.55])
         eye = eye + rng.normal(size=3) * (0.06, 0.06, 0.08)
-        while surfaces.distance_m(eye[None])[0] < 0.35:
+        while surfaces.distance_m(eye[None])[0] < 0.35:  # towards the middle and up, off the furniture
             eye[:2] *= 0.9
             eye[2] = min(eye[2] + 0.03, 1.8)
         poses.append(looking_at(eye, target + rng.normal(size=3) * 0.12, roll=rng.normal() * 0.04))
@@ -193,12 +194,15 @@ def _fused_cloud(
     """xyz (n, 3) float32, rgb (n, 3) uint8 and the object each point was sensed on: one noisy sample per voxel."""
     sensed = [_sense(frame, intrinsics, settings, _stream(seed, CLOUD, view)) for view, frame in enumerate(frames)]
     xyz, rgb, source, in_range = (np.concatenate(column) for column in zip(*sensed, strict=True))
+    # Outliers, anywhere in the room, belong to no object.
     rng, count = _stream(seed, CLOUD), int(settings.outliers * len(xyz))
     anywhere = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (count, 3)) * room.size
     xyz = np.concatenate([xyz, anywhere])
     rgb = np.concatenate([rgb, rng.integers(0, 256, (count, 3), np.uint8)])
     source = np.concatenate([source, np.full(count, FLYING, np.int32)])
     in_range = np.concatenate([in_range, np.ones(count, bool)])
+    # Of each voxel the first sample in random order is kept; a voxel's key has 20 bits for each coordinate. The order
+    # is drawn for all samples, so that one at the limit of the range does not change that of the others.
     order = rng.permutation(len(xyz))
     order = order[in_range[order]]
     cell = np.floor(xyz[order] / settings.voxel_m).astype(np.int64) + 2**19
@@ -215,6 +219,7 @@ def _sense(
     xyz (k, 3), rgb (k, 3), the object that each was sensed on, and whether it lies within the sensor's range.
     """
     pixel = rng.choice(frame.depth_m.size, min(settings.samples_per_view, frame.depth_m.size), replace=False)
+    # A depth edge: the nearest and the farthest of the pixels about differ by more than a twentieth.
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(frame.depth_m, window).ravel()[pixel], cv2.dilate(frame.depth_m, window).ravel()[pixel]
     depth_m = frame.depth_m.ravel()[pixel].astype(np.float64)
@@ -231,6 +236,7 @@ def ground_truth(
     room: Room, surfaces: Surfaces, xyz: NDArray[np.float32], source: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """instance (n,) int32 and background (n,) bool: known where no surface is nearer than that of the ray's target."""
+    # Noise may carry a point to another surface: then it is not the nearest to its own object, and has no truth.
     nearest_m, own_m = surfaces.distance_m(xyz), np.full(len(xyz), np.inf, np.float32)
     for owner in np.unique(source[source != FLYING]):
         items = room.shell if owner == BACKGROUND else (room.objects[owner],)
@@ -265,7 +271,7 @@ def mask_features(
 
 def _area_px(ids: NDArray[np.uint16], owner: NDArray[np.int32], objects: int) -> NDArray[np.int64]:
     """(M, objects): pixels that each mask of a view has on each object."""
-    pair = ids.astype(np.int64) * (objects + 1) + owner + 1
+    pair = ids.astype(np.int64) * (objects + 1) + owner + 1  # column 0: no object, row 0: no mask
     masks = int(ids.max()) + 1
     return np.bincount(pair.ravel(), minlength=masks * (objects + 1)).reshape(masks, objects + 1)[1:, 1:]
 

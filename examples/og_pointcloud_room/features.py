@@ -34,8 +34,10 @@ class FeatureModel:
     texts: NDArray[np.float32]
 
     def __init__(self, classes: int, rng: np.random.Generator) -> None:
+        # Orthonormal: T, the part of J that is no text's, and u_c of each class.
         basis = np.linalg.qr(rng.normal(size=(WIDTH, classes + 2)))[0].T
         text_common, image_only, self._class_directions = basis[0], basis[1], basis[2:]
+        # Weights follow from the cosines: two texts share T, two images J', an image and a wrong text what J' has of T.
         text_weight, image_weight = np.sqrt(TEXT_TEXT), np.sqrt(IMAGE_IMAGE)
         shared = UNMATCHED / (text_weight * image_weight)
         self._image_common = image_weight * (shared * text_common + np.sqrt(1 - shared**2) * image_only)
@@ -43,12 +45,14 @@ class FeatureModel:
         self._image_class_weight = (MATCHED - UNMATCHED) / self._text_class_weight
         self._confusion = CONFUSION / self._text_class_weight
         self._text_common = text_weight * text_common
+        # What of a unit vector's squared length the other parts leave.
         spent = IMAGE_IMAGE + self._image_class_weight**2 + classes * self._confusion**2
         self._noise_weight = np.sqrt(1 - spent)
         self.texts = (self._text_common + self._text_class_weight * self._class_directions).astype(np.float32)
 
     def words(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """(count, 512) unit rows: texts that no class is."""
+        # At right angles to T, whose vector here has the squared length TEXT_TEXT.
         own = rng.normal(size=(count, WIDTH))
         own -= np.outer(own @ self._text_common, self._text_common) / TEXT_TEXT
         own /= np.linalg.norm(own, axis=1, keepdims=True)

@@ -49,6 +49,7 @@ def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> ND
 
     owner: (H, W) int32, the object seen at each pixel, -1 for walls, floor and ceiling.
     """
+    # A proposer's errors one after another: joined, missing, split and spurious masks.
     regions = [owner == instance for instance in np.unique(owner[owner >= 0])]
     regions = _merged(regions, noise.merge, rng)
     regions = [region for region in regions if rng.uniform() >= noise.miss]
@@ -57,6 +58,7 @@ def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> ND
     ]
     if rng.uniform() < noise.spurious:
         regions.append(_blob(owner, rng))
+    # Numbered and painted in random order: of masks that overlap at their edges either may lie on top.
     ids = np.zeros(owner.shape, np.uint16)
     for rank, index in enumerate(rng.permutation(len(regions))):
         _paint(ids, regions[index], rank + 1, noise.edge_px, rng)
@@ -113,6 +115,7 @@ def _paint(ids: NDArray[np.uint16], region: NDArray[np.bool_], number: int, edge
     margin = int(np.ceil(3 * edge_px)) + 1
     top, bottom = max(int(rows.min()) - margin, 0), int(rows.max()) + margin + 1
     left, right = max(int(columns.min()) - margin, 0), int(columns.max()) + margin + 1
+    # The region is where its signed distance exceeds 0; where it exceeds a smooth field instead, edges wander.
     inside = region[top:bottom, left:right]
     signed_px = np.where(inside, _distance_px(inside), -_distance_px(~inside))
     coarse = np.clip(

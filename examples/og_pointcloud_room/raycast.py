@@ -48,6 +48,7 @@ class Surfaces:
     def __init__(self, items: Iterable[Item]) -> None:
         self._scene = o3d.t.geometry.RaycastingScene()
         owners, corners = [], []
+        # Open3D numbers geometries in the order in which they are added, and triangles within each from 0.
         for index, item in enumerate(items):
             for part in item.parts:
                 self._scene.add_triangles(tensor(part.vertices), tensor(part.triangles, np.uint32))
@@ -55,6 +56,7 @@ class Surfaces:
                 corners.append(part.vertices[part.triangles])
         self.part_item = np.array(owners)
         self._first_triangle = np.cumsum([0, *map(len, corners)])
+        # Each triangle's plane, normal . x = offset: where a ray meets it is computed from these.
         first, second, third = np.concatenate(corners).transpose(1, 0, 2)
         across = np.cross(second - first, third - first)
         self._normal = across / np.maximum(np.sqrt(_dot(across, across)), 1e-12)[:, None]
@@ -65,7 +67,7 @@ class Surfaces:
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=1)
         found = self._scene.cast_rays(tensor(rays))
         part = found["geometry_ids"].numpy().astype(np.int64)
-        missed = part >= len(self.part_item)
+        missed = part >= len(self.part_item)  # Open3D says "none" by its largest id
         part[missed] = -1
         triangle = self._first_triangle[part] + np.where(missed, 0, found["primitive_ids"].numpy())
         triangle[missed] = 0
@@ -74,7 +76,7 @@ class Surfaces:
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (offset - _dot(normal, np.asarray(origin))) / steepness
         distance[missed] = np.nan
-        return Hits(part, distance, normal * -np.sign(steepness)[:, None])
+        return Hits(part, distance, normal * -np.sign(steepness)[:, None])  # triangles are wound either way
 
     def is_blocked(self, starts: Points, steps: Points) -> NDArray[np.bool_]:
         """(n,) whether a surface lies between ``starts`` and ``starts + steps``, both (n, 3)."""
@@ -142,7 +144,7 @@ class RayCaster:
             raise ValueError(f"{int((hits.part < 0).sum())} rays leave the room; expected a camera inside it")
         xyz = eye + directions * hits.distance[:, None]
         shaded = self._albedo(xyz, hits.part) * self._light_at(xyz, hits.normal)[:, None]
-        image = (255 * np.sqrt(np.minimum(shaded, 1))).astype(np.uint8)
+        image = (255 * np.sqrt(np.minimum(shaded, 1))).astype(np.uint8)  # the square root stands for sRGB's curve
         depth_m = hits.distance.astype(np.float32).reshape(shape)
         return Frame(camera_to_world, depth_m, self._part_owner[hits.part].reshape(shape), image.reshape(*shape, 3))
 
@@ -155,7 +157,7 @@ class RayCaster:
 
     def _light_at(self, xyz: Points, normals: Points) -> Points:
         """Lambert: a ceiling light that casts shadows, fill lights and a little ambient light. (n,)."""
-        start = xyz + 2e-3 * normals
+        start = xyz + 2e-3 * normals  # off the surface, which would else hide the light from itself
         towards = self._light - start
         distance = np.sqrt(_dot(towards, towards))
         facing = np.maximum(_dot(normals, towards), 0) / distance

@@ -97,6 +97,7 @@ class Drive:
             noisy = ranges + lidar.noise_m * rng.normal(size=len(ranges))
             noisy[rng.uniform(size=len(ranges)) < lidar.dropouts] = np.nan
             truth = np.where(np.isfinite(noisy), truth, NO_RETURN).astype(np.int32)
+            # Points are in the sensor's frame, so an error of localisation moves all of them together.
             believed = pose.copy()
             believed[:3, :3] = rotation_about("z", lidar.pose_noise_rad * rng.normal()) @ pose[:3, :3]
             believed[:3, 3] += lidar.pose_noise_m * rng.normal(size=3)
@@ -153,6 +154,7 @@ def free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> P
     x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
     floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     from_path, from_taken = (np.linalg.norm(floor[:, None] - places, axis=2).min(axis=1) for places in (path, taken))
+    # Each clearance in parts of what is wanted; where no place has all of it, the freest one is taken.
     asked = (_clearance(surfaces, floor) / CLEAR_OF_FURNITURE_M, from_path / CLEAR_OF_PATH_M, from_taken / APART_M)
     free = np.min(np.array(asked), axis=0)
     return floor[np.where(free >= min(1.0, free.max()), from_path, np.inf).argmin()]
@@ -166,6 +168,7 @@ def ring(room: Room) -> Points:
     places = around[:, None] * shares[None, :, None]
     clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(RING_STEPS, -1)
     best = shares[clearance.argmax(axis=1)]
+    # Smoothed over 15 steps; the ring is closed, so seven steps of either end are put beyond the other.
     window = np.hanning(17)[1:-1]
     smooth = np.asarray(np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid"), float)
     return around * smooth[:, None]

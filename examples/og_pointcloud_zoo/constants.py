@@ -245,6 +245,7 @@ def _in_module(path: str, value: Any) -> Iterator[None]:
 def _put(module: Any, name: str, value: Any, path: str) -> None:
     from numba.core.caching import NullCache
 
+    # numba freezes a module's numbers into compiled code, and would load that from the disk.
     changes = getattr(module, name) != value
     setattr(module, name, value)
     if path.startswith("rendering.sightings."):  # where votes are taken follows from two of its numbers

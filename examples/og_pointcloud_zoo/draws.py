@@ -165,9 +165,10 @@ def draw(name: str) -> Draw:
         raise KeyError(name)
     seed = zlib.crc32(name.encode()) % 10_000
     rng = np.random.default_rng([seed, 99])
+    # Each number has its own draw, also where the kind fixes it: fixing one more leaves the others as they were.
     fixed = KINDS[kind]
     numbers: dict[str, Any] = {"all_masked": bool(rng.uniform() < 0.35)}
-    for key, usual in ANY.items():  # in one order, whatever the kind fixes
+    for key, usual in ANY.items():
         numbers[key] = _between(fixed.get(key, usual), rng.uniform())
     for key in ("spans", "taken", "confused", "blurred"):
         if key in fixed:
@@ -178,6 +179,7 @@ def draw(name: str) -> Draw:
 
 
 def _between(limits: tuple[float, float], share: float) -> float:
+    """The value at a share of the way; whole numbers by their logarithm."""
     low, high = limits
     if isinstance(low, int) and low > 0:
         return round(low * (high / low) ** share)

@@ -81,6 +81,7 @@ def _place(draw: Draw) -> RoomCapture:
     if draw.all_masked:
         room = Room(room.size, (*room.objects, *room.shell), ())
     intrinsics = Intrinsics(draw.width, draw.height, 0.82 * draw.width)
+    # A depth sensor looks through glass: the cloud is of the room without it, photographs may show it.
     sensed = _without(room, [k for k, item in enumerate(room.objects) if item.name == GLASS])
     caster = RayCaster(sensed, _stream(draw, TEXTURE))
     poses = place.poses(draw.views, caster.surfaces, _stream(draw, PATH))
@@ -119,7 +120,7 @@ def _named(draw: Draw, class_of: Owners, names: tuple[str, ...], views: int) -> 
             others = [name for group in ALIKE if names[own] in group for name in group if name in names]
             others = [names.index(name) for name in others if name != names[own]] or [own]
             wrong = rng.random(views) < 2 * draw.confused * rng.random()
-            found[wrong, k] = rng.choice(others, int(wrong.sum()))
+            found[wrong, k] = rng.choice(others, int(wrong.sum()))  # a class without one alike stays what it is
     return found
 
 
@@ -152,6 +153,7 @@ def _masked(
     draw: Draw, room: Room, frames: list[Frame], intrinsics: Intrinsics
 ) -> list[tuple[Frame, NDArray[np.uint16]]]:
     """Frames with their masks; with levels each frame three times."""
+    # Which object's mask each pixel is in: things alone; with levels also parts, and things with what stands on them.
     noise = MaskNoise(draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px)
     noises = [
         noise if not blurred else _blurred(noise) for blurred in _stream(draw, MASKS).random(len(frames)) < draw.blurred
@@ -197,6 +199,8 @@ def _cloud(
     mirrors = np.flatnonzero([item.name == MIRROR for item in room.objects])
     shares = {"outliers": draw.outliers, "floaters": draw.floaters, "ghosts": GHOSTS if len(mirrors) else 0}
     extra = {name: int(share * draw.points) for name, share in shares.items()}
+    # Samples are drawn in batches until enough are left: in the room, thinned towards its walls, and seen or by chance
+    # kept hidden.
     wanted, kept = draw.points - sum(extra.values()), []
     for _ in range(200):
         xyz, normal, owner, rgb, offset = sensor(max(draw.points, 10_000), rng)
@@ -212,6 +216,7 @@ def _cloud(
         if sum(len(part[0]) for part in kept) >= wanted:
             break
     xyz, normal, owner, rgb, offset, views = (np.concatenate(column)[:wanted] for column in zip(*kept, strict=True))
+    # Noise counts in spacings of the things' points, as a fit's settings do: the mean distance to the three nearest.
     things = xyz[owner >= 0] if (owner >= 0).any() else xyz
     to_others: Doubles = np.asarray(cKDTree(things).query(things[:20_000], 4)[0])[:, 1:]
     spacing = float(np.median(to_others.mean(axis=1)))
@@ -244,14 +249,14 @@ class _Sampler:
                 weight.append(np.full(count, density))
         self.corners, self.owner, self.colour, weights = map(np.concatenate, (corners, owner, colour, weight))
         across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
-        length = np.sqrt((across**2).sum(axis=1))
+        length = np.sqrt((across**2).sum(axis=1))  # twice the triangle's area
         self.normal = across / np.maximum(length, 1e-12)[:, None]
         self.reach = np.cumsum(length * weights)
 
     def __call__(self, count: int, rng: np.random.Generator) -> Raw:
         """So many, where they are."""
         triangle = np.minimum(np.searchsorted(self.reach, rng.random(count) * self.reach[-1]), len(self.reach) - 1)
-        a, b = np.sqrt(rng.random(count)), rng.random(count)
+        a, b = np.sqrt(rng.random(count)), rng.random(count)  # even over a triangle: a is the way from its first corner
         first, second, third = self.corners[triangle].transpose(1, 0, 2)
         xyz = (1 - a)[:, None] * first + (a * (1 - b))[:, None] * second + (a * b)[:, None] * third
         blend = rng.random((count, 1))
@@ -265,6 +270,7 @@ def _views(
 ) -> Owners:
     """(n,) how many frames see each point: it is in the image, and no surface is before it; or, without surfaces, it
     is no deeper than what its pixel shows."""
+    # Sums written out, not matrix products, whose last bit depends on the processor.
     count, half = np.zeros(len(xyz), np.int32), np.array([intrinsics.width / 2, intrinsics.height / 2])
     points = np.asarray(xyz, np.float64)
     for frame in frames:
@@ -283,6 +289,7 @@ def _views(
             count[inside] += depth[inside] < 1.02 * frame.depth_m[row[inside], column[inside]] + 0.01
         else:
             steps = shifted[inside]
+            # The ray ends 2 mm before the point, or its own surface would hide it.
             clear = 1 - 2e-3 / np.sqrt((steps**2).sum(axis=1))
             start = np.broadcast_to(pose[:3, 3], steps.shape)
             count[inside] += ~surfaces.is_blocked(start, steps * clear[:, None])
@@ -323,6 +330,7 @@ def _ghosts(
         pose = frame.camera_to_world
         ray = (pose[:3, :3] * directions[at][:, None]).sum(axis=2)
         touch = pose[:3, 3] + frame.depth_m.ravel()[at][:, None] * ray
+        # The reflected ray says how far; the sensor puts the point straight on, behind the mirror.
         back = ray * (1, -1, 1)
         for start, turned, straight in zip(touch, back, ray, strict=True):
             far = surfaces.cast(start + 1e-3 * turned, turned[None]).distance[0]

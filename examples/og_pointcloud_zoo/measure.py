@@ -128,7 +128,7 @@ def _beside_baselines(
 
 
 def warm_up(scene: Scene) -> None:
-    """Fit two views of a few points, so that no scene's seconds hold the loading of compiled code."""
+    """Fit six views of a few points, so that no scene's seconds hold the loading of compiled code."""
     few = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // 2_000))
     with suppress(OgPointcloudError):
         og.fit(replace(scene, points=few, views=scene.views[:6]), progress=False)

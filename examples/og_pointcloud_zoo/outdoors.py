@@ -227,6 +227,7 @@ class Scanner:
             back = (hits.part >= 0) & (hits.distance < self.range_m) & (owner != names.index(SKY))
             ray, owner, part = ray[back], owner[back], hits.part[back]
             xyz = origin + ray * hits.distance[back, None]
+            # Into soft things rays go an exponential depth, as through leaves, and never out at their back.
             through = np.nan_to_num(surfaces.cast(xyz + 1e-3 * ray, ray).distance)
             deeper = np.minimum(softness[owner] * rng.exponential(size=len(xyz)), 0.9 * through)
             deeper += self.error_m * rng.normal(size=len(xyz))
@@ -260,12 +261,14 @@ class Matched:
         sky = next(k for k, item in enumerate(self.room.objects) if item.name == SKY)
         directions, found = self.intrinsics.directions().reshape(-1, 3), []
         for frame in self.frames:
+            # Pixels are drawn by the strength of their edges; a plain wall has few matches, the sky none.
             grey = frame.image.astype(np.float64).mean(axis=2)
             edge = np.abs(np.gradient(grey)).sum(axis=0) + 0.3
             reach = np.cumsum(np.where(frame.owner == sky, 0, edge).ravel())
             pixel = np.searchsorted(reach, rng.random(count // len(self.frames) + 1) * reach[-1], side="right")
             depth = frame.depth_m.ravel()[pixel].astype(np.float64)
             ray = rotated(directions[pixel], frame.camera_to_world[:3, :3])
+            # Of two views a baseline b apart: depth = f b / disparity, so an error of the disparity grows with depth^2.
             error = (
                 depth**2 * self.error_px / (self.intrinsics.focal_px * self.baseline_m) * rng.normal(size=len(pixel))
             )
@@ -277,6 +280,7 @@ class Matched:
 
 
 def _shuffled(parts: Sequence[tuple[NDArray[Any], ...]], rng: Random) -> Raw:
+    """All parts as one, in random order: the caller takes as many as it wants from the front."""
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = rng.permutation(len(columns[0]))
     return Raw(*(column[order] for column in columns))
