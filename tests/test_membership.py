@@ -248,10 +248,10 @@ def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -
     around, votes = neighbourhood(xyz, GeometrySettings()), view_votes(table)
     result = assign_points(table, votes, groups(numbers), around, replace(STUBBORN, rate_share=0.0))
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
-    group, said = np.array(numbers), []
+    of_view, said = votes_of_views(in_mask, np.array(numbers), table.mask_view), []
     for point, state in enumerate(result.instance_ids):
-        of_groups = np.array([in_mask[group == k, point].sum() for k in range(max(numbers) + 1)])
-        asked = [vote[[k in group[table.mask_view == view] for view in range(6)], point].sum() for k in range(5)]
+        of_groups = of_view[:, :, point].sum(axis=1)
+        asked = of_groups + (result.completeness * (vote - of_view)[:, :, point]).sum(axis=1)
         shares = of_groups / np.maximum(asked, 1e-12)
         best = int(np.argmax(of_groups)) if of_groups.any() else -1
         sure = np.flatnonzero(shares > SETTINGS.sure_share)
@@ -330,13 +330,15 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     table, numbers = random_case(random)
     group = np.array(numbers, np.int32)
     votes = view_votes(table)
-    has_mask = random.uniform(size=(5, 6)) < 0.5
+    complete = some_complete(random)
     allowed = np.array([True, True, False, True, True])
-    actual = _best_group(_by_point(votes.in_mask), _by_point(votes.vote), group, has_mask, allowed, 0.45)
+    columns = _by_point(votes.in_mask), _by_point(votes.vote)
+    actual = _best_group(*columns, group, table.mask_view, complete, allowed, 0.45)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     per_group = np.array([in_mask[group == k].sum(axis=0) if allowed[k] else 0 * in_mask[0] for k in range(5)])
     most = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
-    asked = np.einsum("kv,vn->kn", has_mask, vote)
+    of_view = votes_of_views(in_mask, group, table.mask_view)
+    asked = per_group + np.einsum("kv,kvn->kn", complete, vote - of_view)
     sure = np.where(per_group > 0.45 * asked, per_group, 0)
     surest = sure.argmax(axis=0)
     points = np.arange(200)
@@ -354,14 +356,39 @@ def test_the_share_of_open_views_is_that_of_the_literal_reference(seed: int) -> 
     random = np.random.default_rng(seed)
     table, numbers = random_case(random)
     group, best = np.array(numbers, np.int32), random.integers(-1, 5, 200).astype(np.int32)
-    votes, has_mask = view_votes(table), random.uniform(size=(5, 6)) < 0.5
-    share = _share_openly(_by_point(votes.in_mask), _by_point(votes.vote), group, table.mask_view, has_mask, best)
+    votes, complete = view_votes(table), some_complete(random)
+    columns = _by_point(votes.in_mask), _by_point(votes.vote)
+    share = _share_openly(*columns, group, table.mask_view, complete, best)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
+    of_view = votes_of_views(in_mask, group, table.mask_view)
     for point, k in enumerate(best):
-        mine = np.flatnonzero(group == k) if k >= 0 else []
-        said = sum(in_mask[mask, point] * vote[table.mask_view[mask], point] for mask in mine)
-        asked = (vote[has_mask[k], point] ** 2).sum() if k >= 0 else 0
-        np.testing.assert_allclose(share[point], said / asked if asked else 0, rtol=1e-5)
+        said, weight = of_view[k, :, point], vote[:, point]
+        asked = weight @ (said + complete[k] * (weight - said)) if k >= 0 else 0
+        np.testing.assert_allclose(share[point], weight @ said / asked if asked else 0, rtol=1e-5)
+
+
+def some_complete(random: np.random.Generator) -> NDArray[np.float32]:
+    """(5 groups, 6 views) completeness as it may be: a half of the views have a mask of a group."""
+    return (random.uniform(size=(5, 6)) * (random.uniform(size=(5, 6)) < 0.5)).astype(np.float32)
+
+
+def votes_of_views(in_mask: NDArray[np.float64], group: NDArray[np.int32], mask_view: NDArray[np.int32]) -> NDArray:
+    """(5 groups, 6 views, n) votes for each group in each view."""
+    found = np.zeros((5, 6, in_mask.shape[1]))
+    np.add.at(found, (group[group >= 0], mask_view[group >= 0]), in_mask[group >= 0])
+    return found
+
+
+def test_a_view_whose_mask_holds_half_of_the_object_contradicts_the_rest_with_half_a_voice() -> None:
+    """Three views mask the whole object; two only its left half, as a proposer that splits it does. What they say of
+    the right half would count fully where their masks held all that they see of the object."""
+    table = hand_table(N, [[(OBJECT, ONE)]] * 3 + [[(range(25), ONE)]] * 2)
+    result = decide(table, [0] * 5)
+    np.testing.assert_allclose(result.completeness, [[1, 1, 1, 0.5, 0.5]], rtol=1e-5)
+    np.testing.assert_allclose(result.share[:25], 1, rtol=1e-5)
+    np.testing.assert_allclose(result.share[25:50], 3 / (3 + 2 * 0.5), rtol=1e-5)
+    assert (result.instance_ids[:50] == 0).all()
+    assert (result.instance_ids[50:] == BACKGROUND).all()
 
 
 def test_what_slips_past_an_edge_is_not_grown_over() -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.grouping import group_masks
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
-from og_pointcloud.fitting.membership import assign_points
+from og_pointcloud.fitting.membership import assign_points, views_with_masks
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
@@ -109,8 +109,11 @@ def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> t
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
     By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not, and what
-    neighbours mend is the same for all sizes. Nor does it doubt what few views show: half of the views judge.
+    neighbours mend is the same for all sizes. Nor does it doubt what few views show, or judge how complete masks are:
+    half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
     by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0)
-    return assign_points(table, view_votes(table), groups, around, by_votes).instance_ids, groups.count
+    complete = views_with_masks(table, groups).astype(np.float32)
+    membership = assign_points(table, view_votes(table), groups, around, by_votes, completeness=complete)
+    return membership.instance_ids, groups.count

@@ -3,15 +3,17 @@
 A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
 
     for_k(g)       votes for "in a mask of k" (see `view_votes`)
-    possible_k(g)  all votes on g of the views that have a mask of k: those that could have voted so
+    possible_k(g)  for_k, and the other votes on g of the views that have a mask of k, each times how complete the masks
+                   of k are there: the part of k's sure points seen in that view that lies in them
     share          for_k / possible_k
 
-A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes
-"not k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. Rays that slip past
-an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
-shares on the rim of the object itself. The two are told apart by place and color: a middling share counts only where
-the point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges), and in the end every
-point hears those about it, twice, each as far as it is sure and their colors speak for one thing (colors.py).
+A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
+k", with half a voice if its masks hold but a half of what it sees of k. So a share near 1 means "k", near 0 "seen, and
+not k", however often the proposer misses or splits. Rays that slip past an edge or through a thin surface leave low
+shares on what lies behind, in many views; torn mask edges leave middling shares on the rim of the object itself. The
+two are told apart by place and color: a middling share counts only where the point adjoins surely labelled points of
+the same instance (hysteresis, as in Canny's edges), and in the end every point hears those about it, twice, each as far
+as it is sure and their colors speak for one thing (colors.py).
 
 What rays slip past is also told from a rim by who sees it well: it is in masks of views that see it badly and outside
 those of views that see it openly, where of a rim all say alike. So a middling share counts only where it stays one when
@@ -66,13 +68,15 @@ class Membership:
     that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the
     state that a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the
     part of a group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that
-    the scene's views contradict as a whole."""
+    the scene's views contradict as a whole. completeness: (groups, views) float32 in [0, 1], the part of what a view
+    sees of a group's sure points that lies in its masks of the group; 0 where it has none."""
 
     instance_ids: NDArray[np.int32]
     share: NDArray[np.float32]
     certainty: NDArray[np.float32]
     detection_rate: NDArray[np.float32]
     dismissed: NDArray[np.bool_]
+    completeness: NDArray[np.float32]
 
 
 def assign_points(
@@ -83,22 +87,22 @@ def assign_points(
     settings: MembershipSettings,
     rgb: NDArray[np.uint8] | None = None,
     typical_openness: float | None = None,
+    completeness: NDArray[np.float32] | None = None,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
     ends with no point.
 
-    rgb: (n, 3), or None: colors are not asked. typical_openness: as of `ViewVotes`, of a scene that these points are a
-    part of; None: they are all of it.
+    rgb: (n, 3), or None: colors are not asked. typical_openness, completeness: as of `ViewVotes` and `Membership`, of a
+    scene that these points are a part of; None: they are all of it.
     """
-    has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
-    grouped = groups.group >= 0
-    has_mask[groups.group[grouped], table.mask_view[grouped]] = True
+    has_mask = views_with_masks(table, groups)
     of_points = _of_points(votes)
-    of_masks = groups.group, table.mask_view, has_mask
-    support = _support(of_points, *of_masks, np.ones(groups.count, np.bool_), settings.sure_share)
+    of_masks = groups.group, table.mask_view
+    support = _support(of_points, *of_masks, has_mask.astype(np.float32), np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    if dismissed.any():
-        support = _support(of_points, *of_masks, ~dismissed, settings.sure_share)
+    if completeness is None:
+        completeness = _completeness(votes, *of_masks, has_mask, support)
+    support = _support(of_points, *of_masks, completeness, ~dismissed, settings)
     del of_points
     group, share, total = support.group, support.share, support.total
 
@@ -127,8 +131,17 @@ def assign_points(
         ids = _with_neighbours(ids, support.of_state(ids), around.index, weights, own_vote, 1 / settings.crossing)
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
-        ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
-    )
+        ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32),
+        dismissed, completeness,
+    )  # fmt: skip
+
+
+def views_with_masks(table: MaskTable, groups: MaskGroups) -> NDArray[np.bool_]:
+    """(groups, views): whether a view has a mask of a group."""
+    has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
+    grouped = groups.group >= 0
+    has_mask[groups.group[grouped], table.mask_view[grouped]] = True
+    return has_mask
 
 
 def without_see_through(
@@ -322,21 +335,54 @@ def _support(
     of_points: Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]],
     group: NDArray[np.int32],
     mask_view: NDArray[np.int32],
-    has_mask: NDArray[np.bool_],
+    completeness: NDArray[np.float32],
     allowed: NDArray[np.bool_],
-    sure_share: float,
+    settings: MembershipSettings,
 ) -> _Support:
     """The support of all points. of_points: as `_of_points` answers.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
-    each. has_mask: (groups, views). allowed: (groups,) those that may be chosen.
+    each. completeness: (groups, views), as of `Membership`. allowed: (groups,) those that may be chosen.
     """
+    of_masks = group, mask_view, completeness
     found = []
     for some in of_points:
-        masks, views = some()
-        best, *of_best = _best_group(masks, views, group, has_mask, allowed, sure_share)
-        found.append((best, *of_best, _share_openly(masks, views, group, mask_view, has_mask, best)))
+        votes = some()
+        best, *of_best = _best_group(*votes, *of_masks, allowed, settings.sure_share)
+        found.append((best, *of_best, _share_openly(*votes, *of_masks, best)))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _completeness(
+    votes: ViewVotes,
+    group: NDArray[np.int32],
+    mask_view: NDArray[np.int32],
+    has_mask: NDArray[np.bool_],
+    support: _Support,
+) -> NDArray[np.float32]:
+    """(groups, views) as of `Membership`; 1 where a view has a mask of a group and sees none of its sure points."""
+    sure = np.where(support.share > 0.5, support.group, -1)
+    inside, seen = np.zeros(has_mask.shape), np.zeros(has_mask.shape)
+    masks, views = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (votes.in_mask, votes.vote))
+    _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen)
+    part = np.divide(inside, seen, out=np.ones(has_mask.shape), where=seen > 0)
+    return np.where(has_mask, np.clip(part, 0, 1), 0).astype(np.float32)
+
+
+@njit(cache=True)
+def _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen):  # noqa: ANN001, ANN202
+    """Adds to (groups, views): the votes of masks on their own group's sure points, and all votes on these. sure: (n,)
+    the group that each point is surely of, -1 none."""
+    start, points, vote = masks
+    for mask in range(len(start) - 1):
+        for e in range(start[mask], start[mask + 1]):
+            if group[mask] >= 0 and sure[points[e]] == group[mask]:
+                inside[group[mask], mask_view[mask]] += vote[e]
+    start, points, vote = views
+    for view in range(len(start) - 1):
+        for e in range(start[view], start[view + 1]):
+            if sure[points[e]] >= 0:
+                seen[sure[points[e]], view] += vote[e]
 
 
 def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
@@ -369,7 +415,7 @@ def _fill_columns(indptr, indices, data, low, high, place, rows, values):  # noq
 
 
 @njit(cache=True, parallel=True)
-def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: ANN001, ANN202
+def _best_group(masks, views, group, mask_view, completeness, allowed, sure_share):  # noqa: ANN001, ANN202
     """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total.
 
     Where views that have a mask of that group contradict it, and a smaller group is sure, that one is taken: proposers
@@ -397,15 +443,16 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
                 before += 1
             if before < e:
                 continue
-            of_group = 0.0
+            # Of the views, those that have a mask of the group could have voted for it; what they vote otherwise counts
+            # as far as their masks of it are complete.
+            of_group, asked = 0.0, 0.0
             for other in range(e, end):
-                if group[mask_index[other]] == k:
+                mask = mask_index[other]
+                if group[mask] == k:
                     of_group += mask_vote[other]
-            # Of the views, those that have a mask of the group could have voted for it.
-            asked = 0.0
+                    asked += (1 - completeness[k, mask_view[mask]]) * mask_vote[other]
             for view in range(view_start[g], view_start[g + 1]):
-                if has_mask[k, view_index[view]]:
-                    asked += view_vote[view]
+                asked += completeness[k, view_index[view]] * view_vote[view]
             if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
                 best[g], votes[g], possible[g] = k, of_group, asked
             if of_group > sure_share * asked and (of_group > of_sure or (of_group == of_sure and k < sure)):
@@ -416,7 +463,7 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
 
 
 @njit(cache=True, parallel=True)
-def _share_openly(masks, views, group, mask_view, has_mask, best):  # noqa: ANN001, ANN202
+def _share_openly(masks, views, group, mask_view, completeness, best):  # noqa: ANN001, ANN202
     """(n,) `_Support.share_openly` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
     mask_start, mask_index, mask_vote = masks
     view_start, view_index, view_vote = views
@@ -426,12 +473,14 @@ def _share_openly(masks, views, group, mask_view, has_mask, best):  # noqa: ANN0
             continue
         e, of_group, asked = mask_start[g], 0.0, 0.0
         for view in range(view_start[g], view_start[g + 1]):
+            inside = 0.0
             while e < mask_start[g + 1] and mask_view[mask_index[e]] <= view_index[view]:
                 if group[mask_index[e]] == best[g]:
-                    of_group += mask_vote[e] * view_vote[view]
+                    inside += mask_vote[e]
                 e += 1
-            if has_mask[best[g], view_index[view]]:
-                asked += view_vote[view] ** 2
+            of_group += inside * view_vote[view]
+            complete = completeness[best[g], view_index[view]]
+            asked += (inside + complete * (view_vote[view] - inside)) * view_vote[view]
         share[g] = of_group / asked if asked > 0 else 0.0
     return share
 

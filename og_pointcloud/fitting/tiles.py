@@ -362,11 +362,12 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
 @dataclass(frozen=True)
 class _Grouped:
     """What is decided for all tiles. groups: of masks, without those that the scene's views contradict. looks: theirs.
-    typical_openness: how openly points of the scene are seen."""
+    typical_openness: how openly points of the scene are seen. completeness: of the groups, as of `Membership`."""
 
     groups: MaskGroups
     looks: Looks
     typical_openness: float
+    completeness: NDArray[np.float32]
 
 
 def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> _Grouped:
@@ -387,7 +388,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     is_noise = np.append(dismissed, False)[groups.group]  # the last for masks without a group, -1
     groups = replace(groups, group=np.where(is_noise, -1, groups.group))
     looks = looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
-    return _Grouped(groups, looks, votes.typical_openness)
+    return _Grouped(groups, looks, votes.typical_openness, judged.completeness)
 
 
 @dataclass(frozen=True)
@@ -410,7 +411,8 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     votes, looks = view_votes(table), grouped.looks
     rgb = cloud.points.rgb
     rgb = None if rgb is None else rgb[cloud.members[tile]]
-    state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.typical_openness)
+    of_scene = grouped.typical_openness, grouped.completeness
+    state = assign_points(table, votes, grouped.groups, around, membership, rgb, *of_scene)
     ids = by_look(votes, state.instance_ids, looks)
     # Points of the margin helped to decide; they are another tile's own, and counted there.
     inner = cloud.inner(tile)
