@@ -103,7 +103,7 @@ def empty_word() -> object:
     return segment(labelled_cloud(), {"": unit_rows(1, 16)[0]})
 
 
-@refuses(OgPointcloudError, "'' is not among the 5 known words", "pass {name: vector}", "text_features=FILE.npz")
+@refuses(OgPointcloudError, "a label is empty", "expected words", "name what you want to find")
 def empty_word_without_a_vector() -> object:
     """The empty string as a word to look up."""
     return segment(labelled_cloud(), "")
