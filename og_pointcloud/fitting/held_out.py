@@ -1,10 +1,10 @@
 """How large a point is drawn, decided by views that were held out: no truth, no photograph, no threshold is needed.
 
-Too large and points hide what lies behind their edge; too small and light slips through a surface and labels what is
+Too large, and points hide what lies behind their edge; too small, and rays slip through a surface and label what is
 behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are made from every
 other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
-those views show depends on the size too; each size therefore judges all of them, and the best on average is taken. (A
-size that judged itself would always find large opaque points to agree with themselves.)
+those views show depends on the size too, so the labels of each size are judged with points of every size, and the best
+on average is taken. (Judged with their own size alone, large opaque points would always agree with themselves best.)
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
 FEWEST_VIEWS = 4
-"""Fewer cannot be halved so that views of one half contradict each other."""
+"""Views needed: of fewer, a half has one view, which nothing in it contradicts."""
 
 
 @dataclass(frozen=True)
@@ -54,23 +54,26 @@ def choose_scale(
     geometry = settings.geometry
     if len(geometry.scales) == 1:
         return ScaleChoice(geometry.scales[0], {})
+    # By name, so that a capture's views give the same halves in any order; frames of a video then alternate.
     masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)
     spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
     chosen = [masked[index] for index in np.unique(spread)]
     if len(chosen) < FEWEST_VIEWS:
         return ScaleChoice(geometry.middle_scale, {})
+    # Neighbours are looked up within the sample, as the labels below are of the sample alone.
     sample = sample_of_points(points.xyz, geometry.held_out_points)
     around = neighbourhood(points.xyz[sample], geometry)
     asked = np.zeros(len(points), np.bool_)
     asked[sample] = True
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
-    tables = []
+    tables = []  # by scale, one for each half of the views
     for scale in journal.steps(geometry.scales, "point size"):
         gaussians = isotropic(points, spacing, scale, geometry.opacity)
         halves = (
             mask_table(gaussians, chosen[half::2], near, thickness, by_sight=True, asked=asked) for half in (0, 1)
         )
         tables.append([table.of_points(sample) for table in halves])
+    # Labels of either half, at each scale, judged by the other half as every scale shows it.
     agreements = np.zeros(len(geometry.scales))
     for half in (0, 1):
         for index in range(len(geometry.scales)):
@@ -90,11 +93,12 @@ def note_scale(choice: ScaleChoice, journal: Journal) -> None:
 
 def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
     """How well instances reproduce a table's masks: mean over masks, by area, of the best IoU with what an instance
-    shows in that view. In [0, 1]; torn, merged and missed masks lower it whatever the instances.
+    shows in that view. In [0, 1]; where masks are torn, merged or missed, no instances reach 1.
 
     ids: (n,) int32, the instance of each point, below 0 none; count: how many instances there are.
     """
     shared = weights_by_instance(table.weights, ids, count)
+    # What a view shows of an instance lies in its masks or outside all of them.
     in_view = weights_by_instance(table.outside, ids, count)
     np.add.at(in_view, table.mask_view, shared)
     area = np.asarray(table.weights.sum(axis=1), np.float64).ravel()

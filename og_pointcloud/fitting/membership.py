@@ -22,13 +22,13 @@ each vote counts by itself once more.
 What one view alone has a mask of, and the others show outside all masks, is a thing only if as many views may well have
 missed one: how often they do, the scene's other groups tell.
 
-Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
-that group's own views contradict it and a smaller one is sure, the smaller one has the point.
+A point in masks of several groups gets the one with the most votes. But proposers let large things swallow small ones:
+where that group's own views contradict it and a smaller one is sure, the smaller one gets the point.
 
-Votes of views none of which sees a point openly are hearsay: rays that slip through a surface agree about what lies
+Where no view sees a point openly, all votes on it are hearsay: rays that slip through a surface agree about what lies
 behind it, and are wrong. Such a point is as its neighbours are, if views know these better, unless it is seen nearly as
-openly as others. How openly is measured by the scene's other points, for of surfaces of several noisy layers little is
-seen anywhere.
+openly as others. What counts as openly is measured by the scene's other points: in surfaces of several noisy layers
+little is seen anywhere.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ ENTRIES_AT_ONCE = 1 << 26
 ROUNDS = 2
 """Times that points hear their neighbours: what one round settles, the next hears. Further ones change little."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
+"""(start, rows, values): votes on point g are values[start[g] : start[g + 1]], of the masks or views in rows."""
 
 
 @dataclass(frozen=True)
@@ -151,15 +152,16 @@ def without_see_through(
     focal: NDArray[np.float64],
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
-    """Take from each mask what does not lie at its object's depth, mostly behind it; to that the view is blind, it
-    neither is in the mask nor not. What shows through holes of the object keeps SEEN_THROUGH of its weight (holes.py).
+    """Take from each mask what does not lie at its object's depth, mostly behind it. The view is then blind to that: it
+    neither says "in the mask" nor "not". What shows through holes of the object keeps SEEN_THROUGH of its weight
+    (holes.py).
 
-    A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than a part of what
-    the object looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen
-    through windows, past edges, between the sparse points of the object, or, with a LiDAR that looks over a camera's
-    foreground, not seen by the camera at all. Other views do not always contradict such a mask: those of a camera that
-    goes straight ahead, or stands still, look past the same edges. A smaller run before the object is the edge of a
-    thing that stands there.
+    A mask shows a front surface. Sorted by depth, its points fall into runs, parted by gaps wider than a share of the
+    object's apparent size. The nearest run with a fair part of the mask's weight is the object. What lies behind it was
+    seen through windows, past edges, between the sparse points of the object, or, with a LiDAR that looks over a
+    camera's foreground, not seen by the camera at all. Other views do not always contradict such a mask: those of a
+    camera that goes straight ahead, or stands still, look past the same edges. A smaller run in front of the object is
+    the edge of something that stands there.
 
     world_to_camera: (views, 4, 4) float64. focal: (views,) pixels.
     Returns the table without those weights, and with as much less exposure, of which it keeps what came through holes;
@@ -198,7 +200,7 @@ def without_see_through(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _rays(xyz, points, pose):  # noqa: ANN001, ANN202
-    """Of these points (n,) depth, and (n, 2) place in the image at depth 1."""
+    """(n,) depths of these points, and (n, 2) their places in an image at depth 1."""
     depth, xy = np.empty(len(points)), np.empty((len(points), 2))
     for i, g in enumerate(points):
         depth[i], xy[i, 0], xy[i, 1] = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
@@ -218,6 +220,7 @@ def _at_front(
     if len(depth):
         order = np.argsort(depth)
         depth, weight = depth[order], weight[order]
+        # First the object as a whole, by large gaps; then, within it, what shows through its holes, by small ones.
         front = slice(*_object(depth, weight, settings.gap_sizes * size, share))
         order, depth, weight = order[front], depth[front], weight[front]
         gap = settings.hole_sizes * size * (depth[(len(depth) - 1) // 2] + depth[len(depth) // 2]) / 2  # the median's
@@ -235,6 +238,7 @@ def _object(depth, weight, gap_share, front_share):  # noqa: ANN001, ANN202
     """
     reached = np.cumsum(weight.astype(np.float64))
     gap = gap_share * depth[np.searchsorted(reached, 0.5 * reached[-1])]
+    # begin: where the present run begins; before: the weight of all runs before it; first: where the first run ends.
     first, begin, before = len(depth), 0, 0.0
     for k in range(1, len(depth) + 1):
         if k < len(depth) and not depth[k] - depth[k - 1] > gap:
@@ -253,6 +257,7 @@ def _exposure_left(first_mask, weights, outside, exposure, kept, n, left):  # no
     weight_start, weight_index, weight = weights
     outside_start, outside_index, outside_weight = outside
     start, index, exposed = exposure
+    # Of each point, in one view: all weight, what of it is lost, and what of that was lost behind a hole.
     shown, hidden, behind_hole = np.zeros(n), np.zeros(n), np.zeros(n)
     most, end = np.sum((kept > 0) & (kept < 1)), 0
     through, through_index, through_start = np.empty(most, np.float32), np.empty(most, np.int32), start.copy()
@@ -268,6 +273,7 @@ def _exposure_left(first_mask, weights, outside, exposure, kept, n, left):  # no
         for e in range(start[view], start[view + 1]):
             g = index[e]
             left[e] = 1 - hidden[g] / shown[g] if hidden[g] > 0 else 1
+            # Masks may still be compared by what shows through holes (`MaskTable.with_holes`).
             if behind_hole[g] > 0:
                 through[end], through_index[end] = exposed[e] * behind_hole[g] / shown[g], g
                 end += 1
@@ -285,7 +291,7 @@ def _scaled(matrix: csr_array, factor: NDArray[np.float32]) -> csr_array:
 
 @njit(cache=True)
 def _scale(indptr, columns, values, factor):  # noqa: ANN001, ANN202
-    """Moves the entries that are left to the front; where rows begin."""
+    """Scales the entries and moves those that are left to the front. Returns where rows begin."""
     starts = np.zeros(len(indptr), np.int32)
     end = 0
     for row in range(len(indptr) - 1):
@@ -339,7 +345,7 @@ def _support(
     allowed: NDArray[np.bool_],
     settings: MembershipSettings,
 ) -> _Support:
-    """The support of all points. of_points: as `_of_points` answers.
+    """The support of all points. of_points: as `_of_points` returns it.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
     each. completeness: (groups, views), as of `Membership`. allowed: (groups,) those that may be chosen.
@@ -396,6 +402,7 @@ def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPo
 
 @njit(cache=True)
 def _column_starts(indices, low, high):  # noqa: ANN001, ANN202
+    """(high - low + 1,) where the entries of each column begin, sorted by column."""
     start = np.zeros(high - low + 1, np.int64)
     for e in range(len(indices)):
         if low <= indices[e] < high:
@@ -523,6 +530,7 @@ def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN
 
     Rounds, not a flood in index order: the result does not depend on how the points are ordered.
     """
+    # In a round all waiting points look at the states before it; those that join are seen by the next.
     waiting = np.flatnonzero(possible & (ids < 0))
     while len(waiting):
         joins = np.zeros(len(waiting), np.bool_)
@@ -601,6 +609,7 @@ def instance_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.in
 
 @njit(cache=True)
 def _add_area(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
+    """Adds to ``area`` what each mask shows of points of its own group; masks without a group are passed over."""
     for row in range(len(indptr) - 1):
         for e in range(indptr[row] if group[row] >= 0 else indptr[row + 1], indptr[row + 1]):
             if ids[indices[e]] == group[row]:
@@ -621,6 +630,7 @@ def _without_islands(
     table's masks nearly all the weight stays on the top. A part of the object cut off by an occluder is seen as openly
     as the rest of it.
     """
+    # Pieces: connected components of adjoining points of one instance. density: what masks show of a point, on average.
     n = len(ids)
     source = np.repeat(np.arange(n), neighbourhood.index.shape[1])
     target = neighbourhood.index.ravel()
@@ -630,7 +640,7 @@ def _without_islands(
     labelled = np.flatnonzero(ids >= 0)
     piece_area, points = np.bincount(piece, area, pieces), np.bincount(piece, minlength=pieces)
     density, majority = piece_area / points, np.bincount(piece, share, pieces) > 0.5 * points
-    # The main piece of each instance is the one its masks show most of.
+    # The main piece of each instance is the one its masks show most of: written last, it stays.
     order = labelled[np.argsort(piece_area[piece[labelled]], kind="stable")]
     main = np.zeros(int(ids.max(initial=-1)) + 1, np.int64)
     main[ids[order]] = piece[order]
