@@ -112,9 +112,9 @@ def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
 def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
-    By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not, and what
-    neighbours mend is the same for all sizes. Nor does it doubt what few views show, or judge how complete masks are:
-    half of the views judge.
+    By votes alone, not by neighbours: what these mend is the same for all sizes, and a judge that saw hidden points by
+    hearsay would hold it against labels that do not. Nor does it doubt what few views show, or judge how complete masks
+    are: half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
     by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0)

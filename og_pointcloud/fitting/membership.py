@@ -97,6 +97,8 @@ def assign_points(
     scene that these points are a part of; None: they are all of it.
     """
     has_mask = views_with_masks(table, groups)
+    # Points choose twice. As if all masks were complete: that shows which groups are noise, and what is missing in the
+    # masks of the others. Then among the others, by masks as complete as they are.
     of_points = _of_points(votes)
     of_masks = groups.group, table.mask_view
     support = _support(of_points, *of_masks, has_mask.astype(np.float32), np.ones(groups.count, np.bool_), settings)
@@ -104,7 +106,7 @@ def assign_points(
     if completeness is None:
         completeness = _completeness(votes, *of_masks, has_mask, support)
     support = _support(of_points, *of_masks, completeness, ~dismissed, settings)
-    del of_points
+    del of_points  # the votes sorted by point are as large as the table
     group, share, total = support.group, support.share, support.total
 
     # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
