@@ -251,7 +251,7 @@ def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -
     of_view, said = votes_of_views(in_mask, np.array(numbers), table.mask_view), []
     for point, state in enumerate(result.instance_ids):
         of_groups = of_view[:, :, point].sum(axis=1)
-        asked = of_groups + (result.completeness * (vote - of_view)[:, :, point]).sum(axis=1)
+        asked = of_groups + (result.scene.completeness * (vote - of_view)[:, :, point]).sum(axis=1)
         shares = of_groups / np.maximum(asked, 1e-12)
         best = int(np.argmax(of_groups)) if of_groups.any() else -1
         sure = np.flatnonzero(shares > SETTINGS.sure_share)
@@ -384,7 +384,7 @@ def test_a_view_whose_mask_holds_half_of_the_object_contradicts_the_rest_with_ha
     the right half would count fully where their masks held all that they see of the object."""
     table = hand_table(N, [[(OBJECT, ONE)]] * 3 + [[(range(25), ONE)]] * 2)
     result = decide(table, [0] * 5)
-    np.testing.assert_allclose(result.completeness, [[1, 1, 1, 0.5, 0.5]], rtol=1e-5)
+    np.testing.assert_allclose(result.scene.completeness, [[1, 1, 1, 0.5, 0.5]], rtol=1e-5)
     np.testing.assert_allclose(result.share[:25], 1, rtol=1e-5)
     np.testing.assert_allclose(result.share[25:50], 3 / (3 + 2 * 0.5), rtol=1e-5)
     assert (result.instance_ids[:50] == 0).all()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.grouping import group_masks
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
-from og_pointcloud.fitting.membership import assign_points, views_with_masks
+from og_pointcloud.fitting.membership import SceneVotes, assign_points, views_with_masks
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
@@ -118,6 +118,6 @@ def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> t
     """
     groups = group_masks(table, settings.grouping)
     by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0)
-    complete = views_with_masks(table, groups).astype(np.float32)
-    membership = assign_points(table, view_votes(table), groups, around, by_votes, completeness=complete)
-    return membership.instance_ids, groups.count
+    votes = view_votes(table)
+    scene = SceneVotes(votes.typical_openness, views_with_masks(table, groups).astype(np.float32))
+    return assign_points(table, votes, groups, around, by_votes, scene=scene).instance_ids, groups.count

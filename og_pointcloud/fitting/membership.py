@@ -64,20 +64,29 @@ _ByPoint = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
+class SceneVotes:
+    """What all votes of a scene say, for points that are a part of it. typical_openness: as of `ViewVotes`.
+    completeness: (groups, views) float32 in [0, 1], the part of what a view sees of a group's sure points that lies in
+    its masks of the group; 0 where it has none."""
+
+    typical_openness: float
+    completeness: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
     that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the
     state that a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the
     part of a group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that
-    the scene's views contradict as a whole. completeness: (groups, views) float32 in [0, 1], the part of what a view
-    sees of a group's sure points that lies in its masks of the group; 0 where it has none."""
+    the scene's views contradict as a whole. scene: what all votes said."""
 
     instance_ids: NDArray[np.int32]
     share: NDArray[np.float32]
     certainty: NDArray[np.float32]
     detection_rate: NDArray[np.float32]
     dismissed: NDArray[np.bool_]
-    completeness: NDArray[np.float32]
+    scene: SceneVotes
 
 
 def assign_points(
@@ -87,14 +96,12 @@ def assign_points(
     around: Neighbourhood,
     settings: MembershipSettings,
     rgb: NDArray[np.uint8] | None = None,
-    typical_openness: float | None = None,
-    completeness: NDArray[np.float32] | None = None,
+    scene: SceneVotes | None = None,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
     ends with no point.
 
-    rgb: (n, 3), or None: colors are not asked. typical_openness, completeness: as of `ViewVotes` and `Membership`, of a
-    scene that these points are a part of; None: they are all of it.
+    rgb: (n, 3), or None: colors are not asked. scene: of which these points are a part; None: they are all of it.
     """
     has_mask = views_with_masks(table, groups)
     # Points choose twice. As if all masks were complete: that shows which groups are noise, and what is missing in the
@@ -103,17 +110,16 @@ def assign_points(
     of_masks = groups.group, table.mask_view
     support = _support(of_points, *of_masks, has_mask.astype(np.float32), np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    if completeness is None:
-        completeness = _completeness(votes, *of_masks, has_mask, support)
-    support = _support(of_points, *of_masks, completeness, ~dismissed, settings)
+    if scene is None:
+        scene = SceneVotes(votes.typical_openness, _completeness(votes, *of_masks, has_mask, support))
+    support = _support(of_points, *of_masks, scene.completeness, ~dismissed, settings)
     del of_points  # the votes sorted by point are as large as the table
     group, share, total = support.group, support.share, support.total
 
     # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
     # all that look at a car see the same floor through its roof.
     agreed = (group >= 0) & (share > settings.sure_share)
-    typical = votes.typical_openness if typical_openness is None else typical_openness
-    least_open = settings.open_share * typical
+    least_open = settings.open_share * scene.typical_openness
     hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
     weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
@@ -135,7 +141,7 @@ def assign_points(
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32),
-        dismissed, completeness,
+        dismissed, scene,
     )  # fmt: skip
 
 
@@ -350,7 +356,7 @@ def _support(
     """The support of all points. of_points: as `_of_points` returns it.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
-    each. completeness: (groups, views), as of `Membership`. allowed: (groups,) those that may be chosen.
+    each. completeness: (groups, views), as of `SceneVotes`. allowed: (groups,) those that may be chosen.
     """
     of_masks = group, mask_view, completeness
     found = []
@@ -368,7 +374,7 @@ def _completeness(
     has_mask: NDArray[np.bool_],
     support: _Support,
 ) -> NDArray[np.float32]:
-    """(groups, views) as of `Membership`; 1 where a view has a mask of a group and sees none of its sure points."""
+    """(groups, views) as of `SceneVotes`; 1 where a view has a mask of a group and sees none of its sure points."""
     sure = np.where(support.share > 0.5, support.group, -1)
     inside, seen = np.zeros(has_mask.shape), np.zeros(has_mask.shape)
     masks, views = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (votes.in_mask, votes.vote))

@@ -34,7 +34,7 @@ from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
-from og_pointcloud.fitting.membership import assign_points, without_see_through
+from og_pointcloud.fitting.membership import SceneVotes, assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
@@ -362,12 +362,11 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
 @dataclass(frozen=True)
 class _Grouped:
     """What is decided for all tiles. groups: of masks, without those that the scene's views contradict. looks: theirs.
-    typical_openness: how openly points of the scene are seen. completeness: of the groups, as of `Membership`."""
+    scene: what all votes say."""
 
     groups: MaskGroups
     looks: Looks
-    typical_openness: float
-    completeness: NDArray[np.float32]
+    scene: SceneVotes
 
 
 def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> _Grouped:
@@ -388,7 +387,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     is_noise = np.append(dismissed, False)[groups.group]  # the last for masks without a group, -1
     groups = replace(groups, group=np.where(is_noise, -1, groups.group))
     looks = looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
-    return _Grouped(groups, looks, votes.typical_openness, judged.completeness)
+    return _Grouped(groups, looks, judged.scene)
 
 
 @dataclass(frozen=True)
@@ -411,8 +410,7 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     votes, looks = view_votes(table), grouped.looks
     rgb = cloud.points.rgb
     rgb = None if rgb is None else rgb[cloud.members[tile]]
-    of_scene = grouped.typical_openness, grouped.completeness
-    state = assign_points(table, votes, grouped.groups, around, membership, rgb, *of_scene)
+    state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.scene)
     ids = by_look(votes, state.instance_ids, looks)
     # Points of the margin helped to decide; they are another tile's own, and counted there.
     inner = cloud.inner(tile)
