@@ -127,6 +127,8 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     survey.classification, survey.user_data = np.where(np.arange(count) < 9, 2, 30), np.arange(count)
     for field in {"gps_time", "red", "nir"} & set(survey.point_format.dimension_names):
         survey[field] = np.arange(count) * 300
+    angle, step = ("scan_angle_rank", 1) if point_format < 6 else ("scan_angle", 0.006)  # degrees, as LAS 1.2 and 1.4
+    survey[angle] = np.arange(count) * 15 - 90
     survey.write(tmp_path / "survey.laz")
     label = np.where(np.arange(count) < 5, 0, -1).astype(np.int32)
     attributes = {"og_label": label, "og_instance": label, "og_score": np.ones(count, np.float32)}
@@ -137,6 +139,7 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     for field in survey.point_format.dimension_names:
         if field in ("X", "Y", "Z", "intensity", "gps_time", "red", "green", "nir", "height", "user_data"):
             assert np.array_equal(found[field], survey[field]), field
+    assert np.array_equal(found.scan_angle * 0.006, np.asarray(survey[angle]) * step)
     assert found.classification.tolist() == [64] * 5 + [2] * 4 + [30] * 3
     assert found.og_label.tolist() == label.tolist()
     assert [record.user_id for record in found.vlrs].count("og_pointcloud") == 1

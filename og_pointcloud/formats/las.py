@@ -46,6 +46,8 @@ FULL_RANGE = 257
 """An 8-bit color times this spans the format's 16 bits."""
 EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 """Point formats before LAS 1.4 have 32 classes only: for each, the later format that holds all that it does."""
+DEGREES_PER_STEP = 0.006
+"""What scan angles count since LAS 1.4; before, whole degrees."""
 OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 LONGEST_RECORD = 65_535
@@ -140,7 +142,10 @@ def _points_of(source: Path, count: int) -> LasData:
         las = reader.read()
         if len(las.points) != count:
             raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
+    degrees = getattr(las, "scan_angle_rank", None)
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
+    if degrees is not None:  # laspy leaves it out, as it has another name and unit now
+        las.scan_angle = np.rint(np.asarray(degrees) / DEGREES_PER_STEP).astype(np.int16)
     own = [name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS]
     if "og_label" in own:  # an earlier run's class would be taken for one of the new labels
         las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
