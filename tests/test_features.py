@@ -231,26 +231,6 @@ def test_resolution_of_the_images_does_not_matter(tiny: Rendered) -> None:
     np.testing.assert_allclose(learn_features(larger).features, learn_features(tiny.table).features, atol=1e-5)
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-@pytest.mark.parametrize("apart", [0.0, 1e-12, 1e-7, 1e-3])
-def test_means_that_have_met_separate(apart: float, normalise: bool) -> None:
-    weights = csr_array(np.kron(np.eye(3), np.ones((1, 50))).astype(np.float32))
-    nothing = csr_array((1, 150), dtype=np.float32)
-    table = MaskTable(
-        weights, nothing, nothing, np.zeros(3, np.int32), np.full(3, 50, np.int32), np.zeros((3, 1), np.float32)
-    )
-    start = np.full((150, WIDTH), 0.4, np.float32)
-    start[50:] += np.float32(apart)
-    settings = FeatureSettings(normalise=normalise)
-    learned = learn_features(table, settings, start=start)
-    assert np.isfinite(learned.objective).all()
-    assert learned.converged
-    means = weights @ learned.features / 50
-    apart_now = [np.linalg.norm(means[i] - means[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
-    # Three directions that shun each other lie on a triangle: sqrt(3) apart on the unit sphere, half of it mapped.
-    assert min(apart_now) > (0.8 if normalise else 1.6)
-
-
 def test_a_view_without_two_masks_has_no_separation() -> None:
     learned = learn_features(random_views(mask_counts=(1, 1)).table)
     assert learned.converged

@@ -25,7 +25,6 @@ NAIVE_BREAKS = {
     "feature_length": 1e-40,
     "eq2_gradient": 1e-7,
     "eq1_value": 1e-5,
-    "eq2_descent": 1e-19,
     "kmeans_offset": 1e6,
     "vector_length": 1e37,
     "nearly_equal_words": 1e-5,

@@ -16,13 +16,10 @@ from og_pointcloud.fitting.association import describe_instances
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.learned.codebook import kmeans, two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import FeatureObjective, learn_features
-from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.scene import Points, Scene
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, PaperSettings
 
 MASKS, EACH = 3, 200
-SEPARATE = np.sqrt(3)
-"""Distance between three means that are as far apart as the unit ball lets them."""
 RAW = FeatureSettings(intra=False, normalise=False)
 
 
@@ -63,25 +60,6 @@ def eq1_value(spread: float) -> Answer:
     means = wide @ features / size[:, None]
     exact = sum((w * np.square(features - mean).sum(axis=1)).sum() for w, mean in zip(wide, means, strict=True))
     return Answer(cohesion, exact / size.sum(), lambda: naive.eq1(weights, features))
-
-
-@agrees(0.02, "distance of the means at the start", powers(-1, -19, -2))
-def eq2_descent(distance: float) -> Answer:
-    """How far apart three means come that start this near each other; naive: Adam on the printed loss."""
-    start = np.zeros((MASKS, 6))
-    start[:, :MASKS] = distance / np.sqrt(2) * np.eye(MASKS)
-    learned = learn_features(_apart(), RAW, start=start.repeat(EACH, axis=0).astype(np.float32))
-    reached = learned.features.reshape(MASKS, EACH, 6).mean(axis=1)
-    return Answer(_reached(reached), SEPARATE, lambda: _reached(naive.eq2_adam(start)))
-
-
-@agrees(0.02)
-def equal_means() -> Answer:
-    """The same from exactly equal features, where the printed Eq. 2 is infinite and its gradient 0 / 0."""
-    start = np.full((MASKS * EACH, 6), 0.2, np.float32)
-    learned = learn_features(_apart(), RAW, start=start)
-    reached = learned.features.reshape(MASKS, EACH, 6).mean(axis=1)
-    return Answer(_reached(reached), SEPARATE, lambda: _reached(naive.eq2_adam(start[::EACH])))
 
 
 @agrees(1e-6)
@@ -227,14 +205,3 @@ def _losses(image: NDArray[np.float64], mask: NDArray[np.int64]) -> Answer:
         np.concatenate([np.ravel(part) / by for part, by in zip(ours, size, strict=True)]),
         np.concatenate([np.ravel(part) / by for part, by in zip(exact, size, strict=True)]),
     )
-
-
-def _apart() -> MaskTable:
-    """Three masks of one view that share no Gaussian."""
-    return mask_table_of(np.kron(np.eye(MASKS), np.ones((1, EACH))), [0] * MASKS)
-
-
-def _reached(means: NDArray[np.floating]) -> np.floating:
-    """Smallest distance of two means, at most SEPARATE."""
-    apart = [np.linalg.norm(means[i] - means[j]) for i, j in combinations(range(MASKS), 2)]
-    return np.minimum(np.min(apart), SEPARATE)

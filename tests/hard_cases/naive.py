@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from og_pointcloud.scene import Camera
 
 __all__ = [
-    "cosines", "eq1", "eq2_adam", "eq2_gradient", "mean_direction", "nearest", "nearest_centre", "pixel_weights",
+    "cosines", "eq1", "eq2_gradient", "mean_direction", "nearest", "nearest_centre", "pixel_weights",
     "unit",
 ]  # fmt: skip
 
@@ -131,18 +131,3 @@ def eq2_gradient(means: NDArray[np.floating]) -> NDArray[np.floating]:
     np.fill_diagonal(square, np.inf)
     pairs = Single(len(means) * (len(means) - 1))
     return (-4 * apart / (square * square)[..., None]).sum(axis=1) / pairs
-
-
-def eq2_adam(means: NDArray[np.floating], steps: int = 3000, rate: float = 1e-3) -> NDArray[np.floating]:
-    """Means after Adam (Kingma & Ba 2015, its usual constants) on the printed Eq. 2, from these."""
-    means = means.astype(Single)
-    first, second = np.zeros_like(means), np.zeros_like(means)
-    for step in range(1, steps + 1):
-        gradient = eq2_gradient(means)
-        first = Single(0.9) * first + Single(0.1) * gradient
-        second = Single(0.999) * second + Single(0.001) * gradient * gradient
-        moved = first / Single(1 - 0.9**step) / (np.sqrt(second / Single(1 - 0.999**step)) + Single(1e-8))
-        means = means - Single(rate) * moved
-        if not np.isfinite(means).all():
-            break
-    return means

@@ -54,10 +54,6 @@ SUFFICIENT = 1e-4
 """Armijo's share of the fall that the slope promises (Nocedal & Wright, Eq. 3.4)."""
 HALVINGS = 20
 """Lengths of a step that are tried, each half of the one before."""
-KICK = 0.1
-"""Where two means have met, a random direction of this length for each mask is added to its Gaussians."""
-MET = 1e-3
-"""Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
 
 Evaluate = Callable[[NDArray[np.float32]], tuple[float, NDArray[np.float32]]]
 """Raw features -> the objective and its gradient by them."""
@@ -93,18 +89,11 @@ class LearnedFeatures:
     converged: bool
 
 
-def learn_features(
-    table: MaskTable,
-    settings: FeatureSettings | None = None,
-    seed: int = 0,
-    *,
-    start: NDArray[np.floating] | None = None,
-) -> LearnedFeatures:
+def learn_features(table: MaskTable, settings: FeatureSettings | None = None, seed: int = 0) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
-    start: (n, width), raw; None: each mask draws a random direction from the seed and each Gaussian starts at the mean
-    of its masks', so that Gaussians of the same masks start together. Where two means of a view have met in the given
-    start, the gradient vanishes by symmetry: random directions of the masks then part them.
+    Each mask draws a random direction from the seed and each Gaussian starts at the mean of its masks', so that
+    Gaussians of the same masks start together.
 
     The same input and seed give the same features. Raises SceneError if no mask shows a Gaussian.
     """
@@ -114,12 +103,7 @@ def learn_features(
     # A normal vector of unit length has every direction with the same chance.
     random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
-    if start is None:
-        raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)  # masks may cancel
-    else:
-        raw = np.array(start, np.float32)[problem.shown]
-        if settings.inter and problem.have_met(read_features(raw, settings.normalise)):
-            raw += KICK * directions
+    raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)  # masks may cancel
     # From a smooth objective to the one that is wanted; all rounds share one budget of steps.
     objective, steps, converged = [0.0], 0, False
     for closest in (*COARSE_BOUNDS, settings.closest):
@@ -186,10 +170,6 @@ class FeatureObjective:
     def uplift(self, of_masks: NDArray[np.float32]) -> NDArray[np.float32]:
         """(k, width): the mean of rows of masks, by how much each shows of a Gaussian."""
         return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
-
-    def have_met(self, features: NDArray[np.floating]) -> bool:
-        """Whether two mask means of a view are too near to be told apart by the gradient of Eq. 2."""
-        return _nearest_pair(self.mask_means(features), self._first) <= MET**2
 
     def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
         """Both losses at features (k, width) as read, Eq. 2 bounded below the distance ``closest``."""
@@ -363,17 +343,6 @@ def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
             else:
                 pulled[g, c] = across / length if length > 1 else gradient[g, c]
     return pulled
-
-
-@njit(cache=True)
-def _nearest_pair(means, first):  # noqa: ANN001, ANN202
-    """The smallest squared distance between two means of one view; infinite where no view has two."""
-    nearest = np.inf
-    for view in range(len(first) - 1):
-        for i in range(first[view], first[view + 1]):
-            for j in range(first[view], i):
-                nearest = min(nearest, ((means[i] - means[j]) ** 2).sum())
-    return nearest
 
 
 @njit(cache=True)
