@@ -140,7 +140,7 @@ def test_frames_of_a_recording_without_masks_are_left_out_but_fused(tmp_path):
     folder.mkdir()
     names, size = write_seven_scenes(folder)
     add_masks(folder, names[::2], size)
-    with pytest.warns(UserWarning, match="3 of 6 frames have no masks and are left out"):
+    with pytest.warns(UserWarning, match="3 of 6 images have no masks and are left out"):
         scene = read_capture(folder)
     assert [view.name for view in scene.views] == names[::2]
     assert fuse_capture(folder).frames == COUNT

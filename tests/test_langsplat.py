@@ -90,6 +90,9 @@ def test_feature_space(tmp_path):
     assert read_language_features(tmp_path, ["a"], "large")[1] == "unknown", "16-d features are not LangSplat's CLIP"
     (tmp_path / "language_features/feature_space.txt").write_text("my-clip\n")
     assert read_language_features(tmp_path, ["a"], "large")[1] == "my-clip"
+    (tmp_path / "language_features/feature_space.txt").write_bytes(b"\xff")
+    with pytest.raises(SceneError, match="cannot be read as text"):
+        read_language_features(tmp_path, ["a"], "large")
 
 
 def test_an_unknown_level_is_refused(tmp_path):

@@ -262,6 +262,8 @@ def test_other_masks_in_the_folder_of_the_proposer_are_taken_up(tmp_path):
 
 def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     world = make_capture(tmp_path / "c", 5)
+    poses = tmp_path / "c" / "transforms.json"
+    poses.write_bytes(b"\xef\xbb\xbf" + poses.read_bytes())  # the mark that editors of Windows put before it
     assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2"]) == 2
     assert "(-o DIR)" in capsys.readouterr().err
     output = tmp_path / "half"
@@ -275,14 +277,20 @@ def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     assert not (tmp_path / "c" / "masks").exists()
 
 
-def test_colmap_captures_in_place(tmp_path):
-    world = make_world(count=2)
-    write_colmap_text(tmp_path / "sparse" / "0", world)
-    (tmp_path / "images").mkdir()
+def test_colmap_captures(tmp_path):
+    """Its pose files stay as they are: images left out are known by the record of the masks."""
+    world, capture = make_world(count=3), tmp_path / "c"
+    write_colmap_text(capture / "sparse" / "0", world)
     for name in world.names:
-        (tmp_path / "images" / f"{name}.png").write_bytes(plain(0, scenery()))
-    make_masks(tmp_path, QUICK, progress=False)
-    assert all(view.mask_count for view in read_capture(tmp_path).views)
+        write_image(capture / "images" / f"{name}.png", scenery())
+    make_masks(capture, replace(QUICK, every=2), tmp_path / "some", progress=False)
+    with pytest.warns(UserWarning, match="1 of 3 images have no masks and are left out"):
+        assert [view.name for view in read_capture(tmp_path / "some").views] == world.names[::2]
+    make_masks(capture, QUICK, progress=False)
+    assert all(view.mask_count for view in read_capture(capture).views)
+    (capture / "masks" / f"{world.names[1]}.png").unlink()
+    with pytest.raises(SceneError, match="1 of 3 posed images have no mask"):
+        read_capture(capture)
 
 
 def test_an_existing_folder_of_masks_as_proposer(tmp_path):

@@ -43,14 +43,21 @@ from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, require_scaled, without_suffix
 from og_pointcloud.formats.kitti360 import find_static_cloud
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
-from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
+from og_pointcloud.formats.mask_files import (
+    FEATURES_NAME,
+    MASKS_FOLDER,
+    MaskLayer,
+    made_of_some,
+    read_masks,
+    rows_shown,
+)
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.photogrammetry import find_photogrammetry, read_photogrammetry
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes, the_only
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
-from og_pointcloud.scene import NOT_SEEN, Camera, CutMasks, Points, Scene, View
+from og_pointcloud.scene import Camera, CutMasks, Points, Scene, View
 
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
@@ -100,7 +107,7 @@ def read_capture(
     capture = Path(folder)
     applied = read_repairs(capture) if repairs is None else tuple(map(Repair.parse, repairs))
     poses = read_poses(capture, applied)
-    shown = _with_masks(capture, poses) if poses.is_recording else poses
+    shown = _with_masks(capture, poses) if poses.is_recording or made_of_some(capture) else poses
     layers, feature_space = _layers(capture, shown, mask_level)
     layers = repaired_layers(layers, applied)
     points = read_geometry(capture, poses, gaussians)  # all frames: depth counts without masks too
@@ -211,12 +218,13 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
 
 
 def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
-    """The frames of a recording that have masks; all of them if none has, since reading the masks says that."""
+    """The images that have masks, of a recording or where masks were made of some only; all of them if none has, since
+    reading the masks says that."""
     has_mask = [_has_mask(capture, name) or _has_mask(capture, posixpath.dirname(name)) for name in poses.names]
     if all(has_mask) or not any(has_mask):
         return poses
     warnings.warn(
-        f"{capture}: {len(has_mask) - sum(has_mask)} of {len(has_mask)} frames have no masks and are left out",
+        f"{capture}: {len(has_mask) - sum(has_mask)} of {len(has_mask)} images have no masks and are left out",
         stacklevel=3,
     )
     kept = [pair for pair, has in zip(zip(poses.names, poses.images, strict=True), has_mask, strict=True) if has]
@@ -265,10 +273,7 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
             f"view '{view}': mask id {last + 1} has no feature row (the features file has {len(layer.features)}): "
             "write one feature row per mask id"
         )
-    used = np.flatnonzero(np.bincount(ids[ids >= 0]))
-    row_of_id = np.full(len(layer.features) + 2, -1, np.int32)  # the last two serve NOT_SEEN and -1
-    row_of_id[NOT_SEEN] = NOT_SEEN
-    row_of_id[used] = np.arange(len(used), dtype=np.int32)
+    used, row_of_id = rows_shown(ids, len(layer.features))
     tracks = None if layer.tracks is None else layer.tracks[used]
     cut = CutMasks(posixpath.dirname(view), used)
     return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks, cut)

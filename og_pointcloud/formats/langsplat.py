@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError, printable
-from og_pointcloud.formats.mask_files import MaskLayer, as_features, require_all
+from og_pointcloud.formats.mask_files import MaskLayer, as_features, require_all, rows_shown
 from og_pointcloud.formats.npy import mapped_array
+from og_pointcloud.formats.poses import read_text
 
 LANGUAGE_FEATURES_FOLDER = "language_features"
 LEVELS = ("default", "small", "medium", "large")
@@ -69,10 +70,7 @@ def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
             f"{id_file}: mask id {highest} of level '{level}' has no feature row ({feature_file.name} has "
             f"{len(features)}): write both files in one run"
         )
-    used = np.flatnonzero(np.bincount(ids.reshape(-1) + 1, minlength=1)[1:])  # without id -1
-    # Old id -> row among those that are kept.
-    row_of_id = np.full(highest + 2, -1, np.int32)  # the last entry serves id -1
-    row_of_id[used] = np.arange(len(used), dtype=np.int32)
+    used, row_of_id = rows_shown(ids, len(features))
     height, width = ids.shape
     return MaskLayer((width, height), features[used], partial(_rows, id_file, level, row_of_id))
 
@@ -108,6 +106,6 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
 def _feature_space(folder: Path, layers: Sequence[MaskLayer]) -> str:
     file = folder / SPACE_FILE
     if file.is_file():
-        return file.read_text(encoding="utf-8").strip() or UNKNOWN_SPACE
+        return read_text(file).strip() or UNKNOWN_SPACE
     width = next(layer.features.shape[1] for layer in layers if len(layer.features))
     return LANGSPLAT_SPACE if width == LANGSPLAT_WIDTH else UNKNOWN_SPACE

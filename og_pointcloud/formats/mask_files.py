@@ -22,10 +22,13 @@ from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
 from og_pointcloud.formats.npy import read_npz
-from og_pointcloud.scene import CutMasks
+from og_pointcloud.formats.poses import read_json_object
+from og_pointcloud.scene import NOT_SEEN, CutMasks
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
+MADE_NAME = "made.json"
+"""The record, in the folder of masks, of the run of `og-pointcloud masks` that made them."""
 TRACKS = ".tracks"
 MAX_FEATURE_BYTES = 1 << 32
 GRAY, PALETTE = 0, 3
@@ -63,6 +66,14 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
         for name, file, header in zip(names, files, headers, strict=True)
     ]
     return layers, feature_space
+
+
+def made_of_some(capture: Path) -> bool:
+    """Whether the record that lies with a capture's masks says that they are of every so many-th image alone."""
+    try:
+        return read_json_object(capture / MASKS_FOLDER / MADE_NAME).get("every", 1) != 1
+    except SceneError:  # masks of others have none
+        return False
 
 
 def require_all(files: Sequence[Path], cure: str) -> None:
@@ -108,6 +119,16 @@ def _read_features(
     features = {name: as_features(arrays[name], f"{file}, '{name}':") for name in names}
     tracks = {name: arrays[key] for key, name in of_tracks.items() if key in arrays}
     return features, tracks, str(arrays.get("feature_space", UNKNOWN_SPACE))
+
+
+def rows_shown(ids: NDArray[np.int32], count: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """(u,) which of ``count`` rows of features an id map shows, ascending; and (count + 2,) the place of each row among
+    these, to be indexed by ids: -1 for rows that are left out, and -1 and NOT_SEEN, its last two, for themselves."""
+    used = np.flatnonzero(np.bincount(ids[ids >= 0], minlength=1))
+    place = np.full(count + 2, -1, np.int32)
+    place[NOT_SEEN] = NOT_SEEN
+    place[used] = np.arange(len(used), dtype=np.int32)
+    return used, place
 
 
 def as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

@@ -115,7 +115,7 @@ def mask_crops(
 
 
 def require_masks(image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> None:
-    """SceneError where the image is not (H, W, 3) uint8, or the masks are not (M, H, W) bool."""
+    """SceneError where the image is not (H, W, 3) uint8, the masks are not (M, H, W) bool, or one has no pixel."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise SceneError(f"the image is {image.dtype} {image.shape}; expected uint8 (H, W, 3), red first")
     if masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
@@ -123,13 +123,13 @@ def require_masks(image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> None:
             f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
             "large as the image"
         )
+    if not masks.any(axis=(1, 2)).all():
+        raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """(top, left, height, width) of the smallest box with all of the mask's pixels; SceneError where it has none."""
+    """(top, left, height, width) of the smallest box with all of a mask's pixels, of which there is one at least."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if len(rows) == 0:
-        raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
     return int(rows[0]), int(columns[0]), int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 
 

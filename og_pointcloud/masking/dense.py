@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import require_masks
@@ -37,8 +36,6 @@ class DenseEncoder(MaskEncoder):
         require_masks(image, masks)
         if len(masks) == 0:
             return np.zeros((0, self.width), np.float32)
-        if not masks.any(axis=(1, 2)).all():
-            raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
         found = self.model.patches(self._pixels(image))
         height, width = found.shape[:2]
         shares = [_shares(mask, width, height) for mask in masks]

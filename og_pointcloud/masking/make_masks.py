@@ -26,8 +26,9 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import locked, replacing, write_file
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
-from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, TRACKS
+from og_pointcloud.formats.mask_files import FEATURES_NAME, MADE_NAME, MASKS_FOLDER, TRACKS
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
+from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
@@ -36,7 +37,6 @@ from og_pointcloud.masking.worker import ImageTask, read_work, results
 VERSION = 3
 """Counts changes of what an image's work file holds; files of another version are made again."""
 WORK_FOLDER = "masks.work"
-MADE_NAME = "made.json"
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 4
 
@@ -240,7 +240,7 @@ def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) 
             continue
         place = target / source.name
         if source.name in TRANSFORMS_NAMES:
-            content = json.loads(source.read_text(encoding="utf-8"))
+            content = read_json_object(source)
             frames = content["frames"]
             content["frames"] = [frame for frame in frames if frame["file_path"].replace("\\", "/") in kept]
             _write_json(place, content)
