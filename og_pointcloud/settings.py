@@ -6,6 +6,7 @@ None of them is a length: distances are in point spacings, weights in pixels, th
 from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field, fields, replace
+from math import inf
 from numbers import Integral, Real
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -18,6 +19,8 @@ ABOVE_ZERO = {
 }  # fmt: skip
 """Numbers that 0 would make meaningless; none may be negative."""
 AT_MOST_ONE = {"opacity", "view_quantile"}
+MAY_BE_INFINITE = {"own_vote"}
+"""With infinite votes for its own state, no point is ever outvoted."""
 
 
 class _Checked:
@@ -49,9 +52,11 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
     least, most = name in ABOVE_ZERO, name in AT_MOST_ONE
     if isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool):
         number = float(value)
-        if number >= 0 and not (number == 0 and least) and not (number > 1 and most):
+        bounded = number <= 1 or not most if number < inf else name in MAY_BE_INFINITE
+        if bounded and number >= 0 and not (number == 0 and least):
             return ""
-    return ("a whole number" if hint is int else "a number") + (" above 0" if least else " from 0") + " to 1" * most
+    kind = "a whole number" if hint is int else "a finite number"
+    return kind + (" above 0" if least else " from 0") + " to 1" * most
 
 
 @dataclass(frozen=True)

@@ -301,7 +301,7 @@ def test_templates_narrow_what_prompts_scatter():
 
 
 def test_settings_refuse_nonsense():
-    with pytest.raises(ValueError, match="sharpness is 0; expected a number above 0, by default"):
+    with pytest.raises(ValueError, match="sharpness is 0; expected a finite number above 0, by default"):
         ChoosingSettings(sharpness=0)
 
 

@@ -48,8 +48,7 @@ def test_what_was_not_measured_is_zero(tmp_path):
     np.save(tmp_path / "a.npy", depth)
     assert read(tmp_path / "a.npy").depth[0, :5].tolist() == [0, 0, 0, 0, 2]
     write_depth(tmp_path / "b.png", np.where(depth == 2, 2.0, 65.535))
-    assert read(tmp_path / "b.png", invalid=65535).depth[0, :5].tolist() == [0, 0, 0, 0, 2]
-    assert read(tmp_path / "b.png").depth[0, 0] == pytest.approx(65.535)
+    assert read(tmp_path / "b.png").depth[0, :5].tolist() == [0, 0, 0, 0, 2]  # the largest number of 16 bits
 
 
 def test_a_smaller_file_scales_its_camera_and_another_shape_is_refused(tmp_path):

@@ -417,10 +417,11 @@ def test_masks_that_show_no_point_are_refused(mode: str) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (lambda: MembershipSettings(crossing=0), "crossing is 0; expected a number above 0, by default 2.0"),
-        (lambda: MembershipSettings(gap_sizes=float("nan")), "gap_sizes is nan; expected a number from 0, by"),
+        (lambda: MembershipSettings(crossing=0), "crossing is 0; expected a finite number above 0, by default 2.0"),
+        (lambda: MembershipSettings(gap_sizes=float("nan")), "gap_sizes is nan; expected a finite number from 0, by"),
+        (lambda: GeometrySettings(reach=float("inf")), "reach is inf; expected a finite number above 0, by default 3"),
         (lambda: GeometrySettings(scales=()), r"scales is \(\); expected a tuple of numbers above 0"),
-        (lambda: GeometrySettings(opacity=1.5), "opacity is 1.5; expected a number above 0 to 1"),
+        (lambda: GeometrySettings(opacity=1.5), "opacity is 1.5; expected a finite number above 0 to 1"),
         (lambda: GroupingSettings(graph_points=0.5), "graph_points is 0.5; expected a whole number above 0"),  # type: ignore[arg-type]
         (lambda: FitSettings(mode="quick"), "mode is 'quick'; expected one of 'grouping', 'fast', 'paper', 'auto'"),  # type: ignore[arg-type]
         (lambda: FitSettings(memory="4GB"), "memory is '4GB'; expected a whole number above 0"),  # type: ignore[arg-type]

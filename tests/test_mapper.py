@@ -249,6 +249,17 @@ def test_readings_between_two_surfaces_are_no_points():
     assert counts[0] == counts[1] < counts[2]
 
 
+def test_whole_numbers_of_depth_are_millimeters_and_the_largest_is_no_reading():
+    camera, points = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4)), []
+    depth = np.full((48, 64), 2.0)
+    depth[:, 40:] = np.nan
+    for image in (depth, np.where(np.isnan(depth), 65535, 2000).astype(np.uint16)):
+        mapper = og.Mapper(spacing=0.05)
+        mapper.integrate(og.Frame(camera, depth=image))
+        points.append(mapper._map.points.xyz)
+    np.testing.assert_array_equal(*points)
+
+
 def test_a_shelf_seen_at_a_slant_alone_becomes_points():
     """Its top lies 8 cm below the lens, so that each row of the image sees 8 cm more of it in depth."""
     camera = og.Camera(64, 120, 500.0, 500.0, 32.0, 60.0, np.eye(4))

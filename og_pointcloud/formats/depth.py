@@ -1,7 +1,8 @@
 """Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
 
 16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are millimeters in a world of meters unless the
-data set says otherwise, stored floats are lengths of the world.
+data set says otherwise, stored floats are lengths of the world. The largest number of 16 bits, 65535, is what sensors
+write for "no reading" or "too far", and as little a depth as 0 is.
 """
 
 from __future__ import annotations
@@ -39,14 +40,12 @@ class DepthFile:
     """A depth image that is read on demand.
 
     camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths of a
-    stored step, None for the rule by type (whole numbers: millimeters of a world in meters; floats: as they are).
-    invalid: a stored value that means "not measured", beside 0, negative numbers, NaN and infinity.
+    stored step, None for the rule by type (`lengths`).
     """
 
     path: Path
     camera: Camera
     unit: float | None = None
-    invalid: int | None = None
     lens: Lens | None = None
 
     def read(self) -> DepthImage:
@@ -57,14 +56,7 @@ class DepthFile:
         stored = _stored(self.path)
         height, width = stored.shape
         require_scaled(f"{self.path} is", (width, height), (self.camera.width, self.camera.height))
-        whole = np.issubdtype(stored.dtype, np.integer)
-        unit = (MILLIMETRE if whole else 1.0) if self.unit is None else self.unit
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN and what overflows are not measured
-            depth = np.asarray(stored, np.float32) * np.float32(unit)
-            measured = np.isfinite(depth) & (depth > 0)
-        if self.invalid is not None:
-            measured &= stored != self.invalid
-        depth = np.where(measured, depth, np.float32(0))
+        depth = lengths(stored, self.unit)
         camera = self.camera.resized(width, height)
         if self.lens is None:
             return DepthImage(depth, camera)
@@ -82,6 +74,19 @@ class DepthFrame:
     name: str
     depth: DepthFile
     colors: Callable[[Camera], NDArray[np.uint8]] | None = None
+
+
+def lengths(stored: NDArray, unit: float | None = None) -> NDArray[np.float32]:
+    """(H, W) float32 world lengths of stored depths, 0 where nothing was measured: 0, negative numbers, NaN, infinity,
+    and of uint16 also its largest number. unit: world lengths of a stored step; None: 1/1000 of whole numbers, which
+    are millimeters of a world in meters, and 1 of floats."""
+    whole = stored.dtype.kind in "iu"
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and what overflows are not measured
+        depth = stored.astype(np.float32) * np.float32((MILLIMETRE if whole else 1.0) if unit is None else unit)
+        measured = np.isfinite(depth) & (depth > 0)
+    if stored.dtype == np.uint16:
+        measured &= stored != np.iinfo(np.uint16).max
+    return np.where(measured, depth, np.float32(0))
 
 
 def find_depth(capture: Path, name: str) -> Path | None:

@@ -58,7 +58,7 @@ class PosedFrames:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A pinhole camera without its pose: pixels, pixel centers at +0.5. unit, invalid: of depth, as `DepthFile`."""
+    """A pinhole camera without its pose: pixels, pixel centers at +0.5. unit: of depth, as `DepthFile`."""
 
     size: tuple[int, int]
     fx: float
@@ -66,7 +66,6 @@ class Sensor:
     cx: float
     cy: float
     unit: float | None = None
-    invalid: int | None = None
 
     @classmethod
     def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> Sensor:
@@ -103,7 +102,7 @@ class RecordedFrame:
             camera, file = self.color.at(self.pose), None
             if self.depth is not None and self.depth[1].is_file():
                 sensor, path = self.depth
-                file = DepthFile(path, sensor.at(self.pose), sensor.unit, sensor.invalid)
+                file = DepthFile(path, sensor.at(self.pose), sensor.unit)
         return PosedImage(self.path, camera, depth=file)
 
 

@@ -4,10 +4,10 @@ ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, 
           ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimeters with intrinsics of its own. A pose
           is all ``-inf`` where tracking was lost. Color and depth share a pose: the extrinsics are the identity.
 7-Scenes  ``frame-000000.color.png``, ``.depth.png``, ``.pose.txt``, in the folder or in ``seq-01/``, ``seq-02/``, ...
-          Depth is 16-bit millimeters, 65535 (and 0) unmeasured. The Kinect was never calibrated: the data set's authors
-          used, and the poses belong to, a depth camera of focal length 585 pixels about the image's middle; color has
-          the wider lens of 525 pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, as TSDF-fusion's
-          copies have, where color and depth are registered) replaces both.
+          Depth is 16-bit millimeters. The Kinect was never calibrated: the data set's authors used, and the poses
+          belong to, a depth camera of focal length 585 pixels about the image's middle; color has the wider lens of 525
+          pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, as TSDF-fusion's copies have, where
+          color and depth are registered) replaces both.
 Replica   as NICE-SLAM renders it: ``results/frame000000.jpg``, ``results/depth000000.png``; line i of ``traj.txt`` is
           the pose of frame i, 16 numbers. ``cam_params.json`` lies in the folder or beside it: ``{"camera": {"w", "h",
           "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a meter.
@@ -43,7 +43,6 @@ from og_pointcloud.formats.poses import (
 
 DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
 """Focal lengths of 7-Scenes in pixels of an image of that width."""
-SEVEN_SCENES_INVALID = 65535
 SEVEN_SCENES_IMAGES = ("frame-*.color.png", "frame-*.color.jpg")
 SEVEN_SCENES_INTRINSICS = "camera-intrinsics.txt"
 REPLICA_PARAMETERS = "cam_params.json"
@@ -125,7 +124,7 @@ def _seven_scenes(folder: Path) -> Iterator[RecordedFrame]:
     if not images:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the color images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
-    depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
+    depth = replace(depth, unit=MILLIMETRE)
     for file in images:
         frame = file.name.split(".")[0]
         source, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")

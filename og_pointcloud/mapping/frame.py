@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.hosts import numbers_of, world_points
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
+from og_pointcloud.formats.depth import lengths
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
@@ -40,7 +41,8 @@ class Frame:
     can be placed.
     masks: (H, W) int, -1 outside of masks (or NOT_SEEN, as of `View`), else a row of features; H, W the camera's.
     features: (M, D) float, one row a mask, as the encoder gave it.
-    depth: (H, W) float, along the optical axis, world lengths, 0 or NaN where nothing was measured; as sparse as it is.
+    depth: (H, W) along the optical axis, as sparse as it is: float, world lengths, 0 or NaN where nothing was measured;
+    or whole numbers, millimeters of a world in meters, as depth images hold them (`formats.depth.lengths`).
     cloud: (n, 3) float, world coordinates, or any cloud that `og.segment` takes, measured from this camera's place, in
     place of depth.
     rgb: (H, W, 3) uint8. stamp: seconds, or any count that grows with time; None: one more than the last frame's.
@@ -137,17 +139,15 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
         raise SceneError(
             f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers ({camera.height}, {camera.width})"
         )
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf: not measured
-        depth = depth.astype(np.float32)
     if frame.cloud is not None:
         with naming(name):
             cloud = world_points(frame.cloud)
         uv_px, z = camera.project(cloud[np.isfinite(cloud).all(axis=1)] - origin)
         inside = camera.shows(uv_px)
         column, row = uv_px[inside].astype(np.intp).T
-        depth = np.full_like(depth, np.inf)
+        depth = np.full(depth.shape, np.inf, np.float32)
         np.minimum.at(depth, (row, column), z[inside].astype(np.float32))
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    return lengths(depth)
 
 
 def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], tolerance: float) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.depth import lengths
 from og_pointcloud.mapping.frame import Frame
 from og_pointcloud.scene import Camera
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
@@ -98,9 +99,7 @@ class FrameAssembler:
         if self._info is None:
             raise SceneError("no camera_info came with it")
         camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
-        depth = parts.depth
-        if depth is not None and depth.dtype.kind == "u":
-            depth = depth.astype(np.float32) * np.float32(1e-3)  # millimeters
+        depth = None if parts.depth is None else lengths(parts.depth)
         # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
         masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
         features = parts.features if has_masks else None
