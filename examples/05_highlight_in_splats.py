@@ -6,12 +6,12 @@ python examples/05_highlight_in_splats.py kitchen.ogpc kitchen_3dgs.ply mug -o m
 import argparse
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 import og_pointcloud as og
 from og_pointcloud.formats.colors import LUMINANCE
-from og_pointcloud.rendering.splatting import Gaussians, render
+from og_pointcloud.formats.images import write_png
+from og_pointcloud.show.drawing import draw
 from og_pointcloud.show.viewpoint import Viewpoint
 
 
@@ -37,12 +37,8 @@ print(selection)
 found = np.isin(scene.instances_at(splats.xyz_world), selection.instances)
 rgb = np.asarray(splats.rgb, np.float32)
 pale = 150 + 0.35 * (rgb @ LUMINANCE)[:, None].repeat(3, axis=1)
-colors = np.where(found[:, None], 0.4 * rgb + 0.6 * np.array([230, 40, 60]), pale).astype(np.float32)
+colors = np.where(found[:, None], 0.4 * rgb + 0.6 * np.array([230, 40, 60]), pale)
 
-# Splats have coordinates about an origin of their own: the camera is moved there. Uncovered pixels become white.
 view = Viewpoint(arguments.eye, arguments.target, np.array([0.0, 0, 1]))
-camera = og.in_world(view.camera(640, 480, 420), -splats.origin)
-image, covered = render(Gaussians.from_points(splats), colors, camera, near=0.1)
-picture = np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)
-cv2.imwrite(str(arguments.output), picture[:, :, ::-1])
+write_png(arguments.output, draw(splats, view.camera(640, 480, 420), colors))
 print(f"wrote {arguments.output}")

@@ -4,18 +4,16 @@ python examples/08_edit_a_scene.py room.ogpc -o OUT    writes edited.png and the
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 import og_pointcloud as og
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
+from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.ply import write_ply
-from og_pointcloud.rendering.geometry import isotropic
-from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Points
+from og_pointcloud.show.drawing import as_splats, draw
 from og_pointcloud.show.viewpoint import Viewpoint
 
 parser = argparse.ArgumentParser(description="Scene editing by words.")
@@ -25,13 +23,12 @@ arguments = parser.parse_args()
 out = arguments.output
 out.mkdir(parents=True, exist_ok=True)
 scene = og.load(arguments.scene)
+files = before, removed, recoloured, inserted = [out / f"{n}.ply" for n in ("before", "removed", "red", "inserted")]
 
 # The room as a splat: round Gaussians as large as the points are apart. A trained 3DGS file would do as well.
-points = Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb)
-splats = isotropic(points, np.full(len(points), scene.cloud.spacing, np.float32), 0.7, 0.95)
-files = before, removed, recoloured, inserted = [out / f"{n}.ply" for n in ("before", "removed", "red", "inserted")]
-gaussians = replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
-write_ply(before, {"vertex": gaussian_rows(gaussians)})
+cloud = scene.cloud
+splats = as_splats(Points(cloud.xyz, cloud.origin, cloud.rgb), cloud.spacing)
+write_ply(before, {"vertex": gaussian_rows(splats)})
 
 # Each edit reads a file and writes the next. halo: points without an instance this near go along with what is removed.
 sofas, cushions = og.select(scene, "sofa").instances, og.select(scene, "cushion").instances
@@ -47,12 +44,6 @@ og.edit.insert(recoloured, out / "chair.ply", inserted, pose)
 # The four files from one viewpoint, across the table towards where the sofa was.
 eye = np.append(table + 1.6 * (table - sofa) / np.linalg.norm(table - sofa), 2.2)
 camera = Viewpoint(eye, np.append(sofa, 0.4), np.array([0.0, 0, 1])).camera(640, 480, 420)
-pictures = []
-for path in files:
-    splat = og.read_points(path)
-    image, covered = render(
-        Gaussians.from_points(splat), np.asarray(splat.rgb, np.float32), og.in_world(camera, -splat.origin), near=0.1
-    )
-    pictures.append(np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)[:, :, ::-1])
-cv2.imwrite(str(out / "edited.png"), np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:])]))
+pictures = [draw(og.read_points(file), camera) for file in files]
+write_png(out / "edited.png", np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:])]))
 print(f"removed {len(sofas) + len(cushions)} instances, recoloured {len(tables)}, wrote {out / 'edited.png'}")

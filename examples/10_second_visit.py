@@ -4,6 +4,7 @@ python examples/10_second_visit.py -o OUT    writes changes.png and growing.png,
 """
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -11,14 +12,15 @@ import numpy as np
 from og_pointcloud_room.second_visit import NAMES, TwoDays
 
 import og_pointcloud as og
+from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.images import write_png
 from og_pointcloud.mapping.map_objects import MapObject
-from og_pointcloud.rendering.geometry import isotropic
-from og_pointcloud.rendering.splatting import render
 from og_pointcloud.scene import Points
+from og_pointcloud.show.drawing import as_splats, draw
 from og_pointcloud.show.viewpoint import Viewpoint
 
-SIZE, STRIP, FONT = (800, 640), (400, 320), cv2.FONT_HERSHEY_SIMPLEX
-COLORS = {"gone": (200, 60, 50), "new": (40, 150, 70), "moved": (40, 90, 200)}
+SIZE, STRIP, FONT, GRAY = (800, 640), (400, 320), cv2.FONT_HERSHEY_SIMPLEX, (50, 50, 50)
+GONE, NEW, MOVED = (200, 60, 50), (40, 150, 70), (40, 90, 200)
 
 parser = argparse.ArgumentParser(description="A map that grows, and a second visit.")
 parser.add_argument("-o", "--output", type=Path, default=Path("out/10"), metavar="OUT", help="folder")
@@ -27,37 +29,30 @@ arguments = parser.parse_args()
 out = arguments.output
 out.mkdir(parents=True, exist_ok=True)
 days = TwoDays(frames=arguments.frames)
-
-eye, up = np.array([-0.3, -0.75, 1.75]) * days.room.size, np.array([0.0, 0, 1])
-camera = Viewpoint(eye, 0.2 * up, up).camera(*SIZE, 800)
-
-
-def drawn(scene: og.LabelledScene, colors: np.ndarray, size: tuple[int, int] = SIZE) -> np.ndarray:
-    """The room from above, without the walls that stand before it. colors: (n, 3), 0 to 255."""
-    low, high = -np.array(days.room.size) / 2 + 0.08, np.array(days.room.size) / 2
-    shown = (scene.xyz[:, 0] > low[0]) & (scene.xyz[:, 1] > low[1]) & (scene.xyz[:, 2] < 2 * high[2] - 0.3)
-    xyz = scene.xyz[shown].astype(np.float32)
-    splats = isotropic(Points(xyz, np.zeros(3)), np.full(len(xyz), scene.cloud.spacing, np.float32), 0.6, 0.95)
-    image, covered = render(splats, np.asarray(colors, np.float32)[shown], camera.resized(*size), near=0.1)
-    return np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)
+room, up = np.array(days.room.size), np.array([0.0, 0, 1])
+camera = Viewpoint(np.array([-0.3, -0.75, 1.75]) * room, 0.2 * up, up).camera(*SIZE, 800)
 
 
-def by_object(scene: og.LabelledScene) -> np.ndarray:
-    """A color for each object, the rest as it is."""
-    palette = np.random.default_rng(3).uniform(60, 230, (1 + scene.instance_ids.max(initial=0), 3))
-    return np.where(
-        scene.instance_ids[:, None] >= 0, palette[scene.instance_ids], 0.4 * np.asarray(scene.cloud.rgb) + 140
-    )
+def drawn(scene: og.LabelledScene, rgb: np.ndarray, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """The room from above, without its ceiling and the walls before the eye. rgb: (n, 3), 0 to 255."""
+    x, y, z = scene.xyz.T
+    shown = (x > 0.08 - room[0] / 2) & (y > 0.08 - room[1] / 2) & (z < room[2] - 0.3)
+    points = Points(scene.cloud.xyz[shown], scene.cloud.origin)
+    return draw(as_splats(points, scene.cloud.spacing), camera.resized(*size), rgb[shown])
 
 
-def tinted(scene: og.LabelledScene, ids: list[int], color: tuple[int, int, int]) -> np.ndarray:
-    """Some objects in one color, the rest pale."""
-    return np.where(np.isin(scene.instance_ids, ids)[:, None], color, 0.55 * np.asarray(scene.cloud.rgb) + 95)
+def tinted(scene: og.LabelledScene, tints: Mapping[int, Sequence[int]]) -> np.ndarray:
+    """(n, 3) colors: objects in their tint, the rest pale."""
+    rgb = 0.55 * np.asarray(scene.cloud.rgb) + 95
+    for k, tint in tints.items():
+        rgb[scene.instance_ids == k] = tint
+    return rgb
 
 
-def written(image: np.ndarray, text: str, entry: MapObject, color: tuple[int, int, int]) -> None:
-    """Writes a name above an object."""
+def written(image: np.ndarray, entry: MapObject, what: str, color: tuple[int, int, int]) -> None:
+    """Writes above an object what it is, and what became of it."""
     ((u, v),), _ = camera.project((entry.place + np.array([0, 0, 0.5 * entry.size[2] + 0.05]))[None])
+    text = f"{name_of(entry)} {what}"
     for thickness, shade in ((6, (255, 255, 255)), (2, color)):
         cv2.putText(image, text, (round(u) - 6 * len(text), round(v) - 12), FONT, 0.7, shade, thickness, cv2.LINE_AA)
 
@@ -68,43 +63,42 @@ def name_of(entry: MapObject) -> str:
 
 
 # Monday: the map grows frame by frame; four pictures on the way.
-mapper, strip, moments = og.Mapper(feature_space=days.feature_space), [], []
-quarters = {round(len(days.before) * share) - 1 for share in (0.1, 0.3, 0.6, 1.0)}
-for number, frame in enumerate(days.before):
+mapper, strip = og.Mapper(feature_space=days.feature_space), []
+for number, frame in enumerate(days.before, 1):
     mapper.integrate(frame)
-    if number in quarters:
+    if number in {round(len(days.before) * share) for share in (0.1, 0.3, 0.6, 1.0)}:
         scene = mapper.snapshot()
-        strip.append(drawn(scene, by_object(scene), STRIP))
-        cv2.putText(strip[-1], f"{number + 1} frames, {len(mapper.objects())} objects", (12, 308),
-                    FONT, 0.55, (60, 60, 60), 1, cv2.LINE_AA)  # fmt: skip
-cv2.imwrite(str(out / "growing.png"), np.hstack(strip)[:, :, ::-1])
-
-# Tuesday: the same mapper goes on; each frame returns what it found changed, and objects keep their ids.
+        by_object = label_colors(np.arange(len(scene.cloud.instances))).tolist()
+        strip.append(drawn(scene, tinted(scene, dict(enumerate(by_object))), STRIP))
+        text = f"{number} frames, {len(mapper.objects())} objects"
+        cv2.putText(strip[-1], text, (12, 308), FONT, 0.55, GRAY, 1, cv2.LINE_AA)
+write_png(out / "growing.png", np.hstack(strip))
 monday, before = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
-changes = [mapper.integrate(frame) for frame in days.after]
+
+# Tuesday: the same mapper goes on. Objects keep their ids, so that two lists of them tell what became of each.
+for frame in days.after:
+    mapper.integrate(frame)
 tuesday, after = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
-moved = {entry.id: entry for change in changes for entry in change.moved if entry.id in before}
-gone = [k for k, entry in after.items() if entry.state == "gone" and k in before]
-tuesday_s = days.after[0].stamp or 0.0
-new = [k for k, entry in after.items() if k not in before and tuesday_s <= entry.since < np.inf]
+start = days.after[0].stamp or 0.0
+gone = [k for k in before if k in after and after[k].state == "gone"]
+moved = [k for k in before if k in after and after[k].state == "moved"]
+new = [k for k in after if k not in before and start <= after[k].since < np.inf]
 
 # Left what is gone, as Monday saw it; right what is new or was moved, as Tuesday sees it.
-left = drawn(monday, tinted(monday, gone, COLORS["gone"]))
-is_moved = np.isin(tuesday.instance_ids, [*moved])
-right = drawn(tuesday, np.where(is_moved[:, None], COLORS["moved"], tinted(tuesday, new, COLORS["new"])))
+left = drawn(monday, tinted(monday, dict.fromkeys(gone, GONE)))
+right = drawn(tuesday, tinted(tuesday, dict.fromkeys(new, NEW) | dict.fromkeys(moved, MOVED)))
 for k in gone:
-    written(left, f"{name_of(before[k])} gone", before[k], COLORS["gone"])
+    written(left, before[k], "gone", GONE)
 for k in new:
-    written(right, f"{name_of(after[k])} new", after[k], COLORS["new"])
-for k, entry in moved.items():
-    ends, _ = camera.project(np.array([entry.before, after[k].place]))
-    for thickness, shade in ((7, (255, 255, 255)), (3, COLORS["moved"])):
-        start, end = (tuple(map(round, point)) for point in ends.tolist())
-        cv2.arrowedLine(right, start, end, shade, thickness, cv2.LINE_AA, tipLength=0.1)
-    written(right, f"{name_of(after[k])} moved", after[k], COLORS["moved"])
+    written(right, after[k], "new", NEW)
+for k in moved:
+    start_px, end_px = camera.project(np.array([before[k].place, after[k].place]))[0].round().astype(int).tolist()
+    cv2.arrowedLine(right, start_px, end_px, (255, 255, 255), 7, cv2.LINE_AA, tipLength=0.1)
+    cv2.arrowedLine(right, start_px, end_px, MOVED, 3, cv2.LINE_AA, tipLength=0.1)
+    written(right, after[k], "moved", MOVED)
 for image, day in ((left, "Monday"), (right, "Tuesday")):
-    cv2.putText(image, day, (16, 34), FONT, 0.9, (40, 40, 40), 2, cv2.LINE_AA)
-cv2.imwrite(str(out / "changes.png"), np.hstack([left, right])[:, :, ::-1])
+    cv2.putText(image, day, (16, 34), FONT, 0.9, GRAY, 2, cv2.LINE_AA)
+write_png(out / "changes.png", np.hstack([left, right]))
 mapper.save(out / "room.ogpc")
 print(f"gone: {[name_of(before[k]) for k in gone]}, new: {[name_of(after[k]) for k in new]}, "
       f"moved: {[name_of(after[k]) for k in moved]}; truth: {days.changed}")  # fmt: skip

@@ -6,7 +6,6 @@ objects.png has mode paper above the default way. The click is on what the defau
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +16,13 @@ from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.labellers import trained_by_rendering
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
+from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.geometry import isotropic
-from og_pointcloud.rendering.splatting import Gaussians, render
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, PaperSettings
+from og_pointcloud.show.drawing import as_splats, draw
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
 parser = argparse.ArgumentParser(description="The paper's figures by its own method.")
@@ -40,80 +40,60 @@ words, _ = og.read_text_features(arguments.capture / "text_features.npz")
 settings = FitSettings(mode="paper", paper=PaperSettings(schedule_share=arguments.share))
 journal = Journal(progress=True)
 prepared = prepare(scene, settings, journal)
-table, surface = prepared.table, prepared.surface
+surface = prepared.surface
 with WorkFolder.open(out / "training.work") as work:
     clouds = {"mode paper": fit_prepared(prepared, settings, journal, work)}
-    features, book = trained_by_rendering(table, surface, settings, journal, work)
-clouds["default"] = og.fit(scene)
+    features, book = trained_by_rendering(prepared.table, surface, settings, journal, work)
+default = clouds["default"] = og.fit(scene)
 
-# Features as colors in four views, and as points seen from above.
-xyz, shown = surface.scene.points.xyz, book.leaf >= 0
-of_scene = surface.of_points(features), surface.of_points(shown)
-instance = clouds["default"].instance_ids
-known = of_scene[1] & (instance >= 0)
-# The last row stays NaN, which is drawn as nothing: for points without an instance.
-means = np.full((instance.max(initial=0) + 2, features.shape[1]), np.nan, np.float32)
-for number in np.unique(instance[known]):
-    means[number] = of_scene[0][known & (instance == number)].mean(axis=0)
-rows = surface.row_of_point
-of_default = np.full_like(features, np.nan)
-of_default[slice(None) if rows is None else rows] = means[np.maximum(instance, -1)]
+# Features as colors in four views and from above, three stages below each other; NaN, for points without any, is gray.
+features, shown, leaves = map(surface.of_points, (features, book.leaf >= 0, book.centers[book.leaf]))
+ids, of_instances = default.instance_ids, np.full_like(features, np.nan)
+for k in np.unique(ids[shown & (ids >= 0)]):
+    of_instances[ids == k] = features[shown & (ids == k)].mean(axis=0)
 stages = {
     "mode paper: features": np.where(shown[:, None], features, np.nan),
-    "mode paper: leaves of the codebook": np.where(shown[:, None], book.centers[book.leaf], np.nan),
-    "default: instances, in the mean color of their points": of_default,
+    "mode paper: leaves of the codebook": np.where(shown[:, None], leaves, np.nan),
+    "default: instances, in the mean color of their points": of_instances,
 }
 up = -np.mean([view.camera.world_to_camera[1, :3] for view in scene.views], axis=0)
-viewpoint = choose_viewpoint(xyz.astype(np.float64), shown, up / np.linalg.norm(up))
+viewpoint = choose_viewpoint(scene.points.xyz.astype(np.float64), shown, up / np.linalg.norm(up))
 height, width = scene.views[0].camera.height, scene.views[0].camera.width
 camera = viewpoint.camera(width, height, FOCAL * height / 2)
 views = [scene.views[index] for index in np.linspace(0, len(scene.views) - 1, 4).astype(int)]
-from_above = View("from above", camera, np.full((height, width), -1, np.int32), np.zeros((0, 1), np.float32))
+views.append(View("from above", camera, np.full((height, width), -1, np.int32), np.zeros((0, 1), np.float32)))
 # Points are drawn all alike: where strays lie far apart, the Gaussians of the method are as large as furniture.
-splats = isotropic(surface.scene.points, np.full(len(xyz), np.median(surface.neighbourhood.spacing)), 0.7, 0.95)
-og.feature_picture(splats, [*views, from_above], surface.near, stages, out / "features.png", columns=5)
+splats = as_splats(scene.points, default.spacing)
+og.feature_picture(Gaussians.from_points(splats), views, surface.near, stages, out / "features.png", columns=5)
 
 # A click on the middle of the word's thing, in the view that shows most of it and all that lies around it.
-best = og.select(clouds["default"], {arguments.word: words.vectors[words.names.index(arguments.word)]}).best
+best = og.select(default, {arguments.word: words.vectors[words.names.index(arguments.word)]}).best
 if best is None:
     raise SystemExit(f"the default way finds no {arguments.word}; take another of {', '.join(words.names)}")
-origin = scene.points.origin
-thing = og.pick(clouds["default"], clouds["default"].xyz_world[instance == best.instance][0])
-masks = [thing.mask(og.in_world(view.camera, origin)) for view in scene.views]
+cameras = [og.in_world(view.camera, scene.points.origin) for view in scene.views]
+thing = og.pick(default, default.xyz_world[ids == best.instance][0])
+masks = [thing.mask(camera) for camera in cameras]
 # A view that cuts the thing off at its border counts a tenth of its pixels.
-cut = [np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any() for mask in masks]
-most = int(np.argmax([mask.sum() * (0.1 if off else 1) for mask, off in zip(masks, cut, strict=True)]))
-inner = cv2.distanceTransform(np.pad(masks[most], 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-row, column = np.unravel_index(inner.argmax(), inner.shape)
-camera = og.in_world(scene.views[most].camera, origin)
+inside = [mask[1:-1, 1:-1].sum() == mask.sum() for mask in masks]
+most = int(np.argmax([mask.sum() * (1 if whole else 0.1) for mask, whole in zip(masks, inside, strict=True)]))
+camera, inner = cameras[most], cv2.distanceTransform(np.pad(masks[most], 1).astype(np.uint8), cv2.DIST_L2, 3)
+row, column = (int(index) - 1 for index in np.unravel_index(inner.argmax(), inner.shape))
 
-points = replace(surface.scene.points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
-write_ply(out / "before.ply", {"vertex": gaussian_rows(points)})
-
-
-def drawn(path: Path) -> np.ndarray:
-    """A splat file as the clicked view shows it, BGR."""
-    points = og.read_points(path)
-    of_view = og.in_world(camera, -points.origin)
-    image, covered = render(Gaussians.from_points(points), np.asarray(points.rgb, np.float32), of_view, surface.near)
-    return np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)[:, :, ::-1]
-
-
+before = out / "before.ply"
+write_ply(before, {"vertex": gaussian_rows(splats)})
 sheet = []
 for name, cloud in clouds.items():
     click = og.pick(cloud, camera, (column + 0.5, row + 0.5))
     print(f"{name}: {len(cloud.instances)} instances, clicked {click}")
-    panels = [drawn(out / "before.ply")]
+    panels = [draw(og.read_points(before), camera, near=surface.near)]
     if click.found:
-        file = out / f"{name.replace(' ', '_')}.ply"
-        og.edit.remove(cloud, click, file, cloud=out / "before.ply", halo=3)
-        panels.append(drawn(file))
-        og.edit.recolour(cloud, click, file, (40, 70, 220), cloud=out / "before.ply")
-        panels.append(drawn(file))
+        gone, painted = (out / f"{name.replace(' ', '_')}_{what}.ply" for what in ("gone", "painted"))
+        og.edit.remove(cloud, click, gone, cloud=before, halo=3)
+        og.edit.recolour(cloud, click, painted, (40, 70, 220), cloud=before)
+        panels += [draw(og.read_points(file), camera, near=surface.near) for file in (gone, painted)]
         lit = click.mask(camera)[:, :, None]
-        panels[0] = np.where(lit, 0.4 * panels[0] + [36, 24, 138], 0.35 * panels[0] + 150).astype(np.uint8)
-    cv2.drawMarker(panels[0], (int(column), int(row)), (0, 0, 0), cv2.MARKER_CROSS, 24, 3)
-    panels += [np.full_like(panels[0], 255)] * (3 - len(panels))
+        panels[0] = np.where(lit, 0.4 * panels[0] + [138, 24, 36], 0.35 * panels[0] + 150).astype(np.uint8)
+    cv2.drawMarker(panels[0], (column, row), (0, 0, 0), cv2.MARKER_CROSS, 24, 3)
     cv2.putText(panels[0], name, (10, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (0, 0, 0), 2, cv2.LINE_AA)
-    sheet.append(np.hstack(panels))
-cv2.imwrite(str(out / "objects.png"), np.vstack(sheet))
+    sheet.append(np.hstack([*panels, *[np.full_like(panels[0], 255)] * (3 - len(panels))]))
+write_png(out / "objects.png", np.vstack(sheet))

@@ -35,7 +35,7 @@ from og_pointcloud.evaluate.captures import ask, score_capture
 from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.repairs import rotation_of_vector
+from og_pointcloud.formats.poses import rotation_of_vector
 
 OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,7 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys):
 
 def test_frames_of_a_bag_are_those_that_were_recorded(tmp_path):
     given = frames(THINGS)
+    given[3] = replace(given[3], masks=np.full_like(given[3].masks, -1), features=given[3].features[:0])
     for frame, read in zip(given, BagFrames(write_bag(tmp_path / "drive", given)), strict=True):
         np.testing.assert_allclose(read.camera.world_to_camera, frame.camera.world_to_camera, atol=1e-6)
         np.testing.assert_allclose(read.depth, frame.depth, atol=6e-4)

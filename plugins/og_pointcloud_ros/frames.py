@@ -76,7 +76,9 @@ class FrameAssembler:
                 raise SceneError(
                     f"features have fields {rows.dtype.names}; expected a field 'feature' with a row a mask"
                 )
-            parts.features = np.asarray(rows["feature"], np.float32).reshape(message.width * message.height, -1)
+            # The width comes from the field: an image without masks has 0 rows of it.
+            width = rows.dtype["feature"].shape or (1,)
+            parts.features = np.asarray(rows["feature"], np.float32).reshape(rows.size, *width)
         else:
             parts.frame_id = message.header.frame_id
             setattr(parts, role, image_array(message))

@@ -1,0 +1,35 @@
+"""Splats as a camera shows them, and a plain cloud made into splats to be shown so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.picking import in_world
+from og_pointcloud.rendering.geometry import isotropic
+from og_pointcloud.rendering.splatting import Gaussians, render
+from og_pointcloud.scene import Camera, Points
+
+SCALE, OPACITY = 0.7, 0.95
+"""Standard deviation, in point spacings, and opacity of a plain point's splat: surfaces look closed."""
+
+
+def as_splats(points: Points, spacing: float) -> Points:
+    """The points as round splats. spacing: typical distance between neighboring points."""
+    splats = isotropic(points, np.full(len(points), spacing, np.float32), SCALE, OPACITY)
+    return replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
+
+
+def draw(
+    splats: Points, camera: Camera, rgb: NDArray[np.number] | None = None, *, near: float = 0.1
+) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB: splats as a camera shows them, on white.
+
+    camera: maps from world coordinates (`in_world`). rgb: (n, 3) colors, 0 to 255; left out, the splats' own. near:
+    depth of the near plane, in the scene's unit. SceneError for points that are no splats (`as_splats`).
+    """
+    colors = np.asarray(splats.rgb if rgb is None else rgb, np.float32)
+    image, covered = render(Gaussians.from_points(splats), colors, in_world(camera, -splats.origin), near)
+    return np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)
