@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import test_choosing
+from commands import run
 from labelled_clouds import SPACE, TOO_FAR, queries, room
 from og_pointcloud_export import write_bundle
 from test_choosing import Made, unit
 
 import og_pointcloud as og
 from og_pointcloud.ask.choosing import Chooser, Reason
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.evaluate.truth import read_truth
@@ -278,12 +278,6 @@ def test_scene_instances_is_the_table_with_boxes(scene, cloud):
 
 
 # Commands
-
-
-def run(capsys, *arguments):
-    code = main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
 
 
 def test_segment_counts_reasons_and_names_the_cure(path, plain, tmp_path, capsys):

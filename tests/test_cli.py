@@ -9,10 +9,9 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from commands import error_of, run
 from scenes import (
     COLOURS,
-    FEATURE_SPACE,
-    FEATURE_WIDTH,
     NAMES,
     UNUSED_NAME,
     sample_surfaces,
@@ -38,26 +37,6 @@ def fitted(tmp_path_factory):
     bundle = folder / "new folder" / "tiny.ogpc"
     assert main(["fit", str(capture.folder), "-o", str(bundle), "--json", str(folder / "run.json")]) == 0
     return capture, bundle
-
-
-def run(capsys, *arguments):
-    """(exit code, stdout, stderr) of one command."""
-    try:
-        code = main([str(argument) for argument in arguments])
-    except SystemExit as leaving:  # argparse leaves by itself
-        code = leaving.code
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
-
-
-def error_of(capsys, *arguments):
-    """The one line a command that must fail writes."""
-    code, _, stderr = run(capsys, *arguments)
-    lines = [line for line in stderr.splitlines() if not line.startswith("warning: ")]
-    assert code == 2
-    assert len(lines) == 1, stderr
-    assert lines[0].startswith("error: ")
-    return lines[0]
 
 
 def test_fitted_points_get_their_names(fitted, tmp_path, capsys):
@@ -230,20 +209,6 @@ def rewrite_npz(path, **changes):
     np.savez(path, **entries)
 
 
-def remove_poses(folder):
-    (folder / "transforms.json").unlink()
-
-
-def remove_a_feature_row(folder):
-    rewrite_npz(folder / "mask_features.npz", view1=np.ones((1, FEATURE_WIDTH), np.float32))
-
-
-def spoil_a_point(folder):
-    xyz, object_ids = sample_surfaces()
-    xyz[7, 1] = np.nan
-    write_ply(folder / "points.ply", xyz, COLOURS[object_ids])
-
-
 def turn_cameras_away(folder):
     transforms = json.loads((folder / "transforms.json").read_text())
     for frame in transforms["frames"]:
@@ -254,18 +219,15 @@ def turn_cameras_away(folder):
 
 
 @pytest.mark.parametrize(
-    ("damage", "texts"),
+    ("damage", "text"),
     [
-        (remove_poses, ["transforms.json"]),
-        (remove_a_feature_row, ["view1", "mask id 2", "feature"]),
-        (spoil_a_point, ["points.ply", "NaN", "row 7"]),
-        (turn_cameras_away, ["no camera sees the cloud"]),
+        (lambda folder: (folder / "transforms.json").unlink(), "transforms.json"),
+        (turn_cameras_away, "no camera sees the cloud"),
     ],
 )
-def test_damaged_captures_are_named_in_one_line(damage, texts, tiny_capture, tmp_path, capsys):
+def test_damaged_captures_are_named_in_one_line(damage, text, tiny_capture, tmp_path, capsys):
     damage(tiny_capture.folder)
-    error = error_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "new" / "s.ogpc")
-    assert all(text in error for text in texts), error
+    assert text in error_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "new" / "s.ogpc")
     assert not (tmp_path / "new").exists()
 
 
@@ -298,24 +260,6 @@ def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     assert "another space" in error
 
 
-def test_text_vectors_of_another_width(fitted, tmp_path, capsys):
-    _, bundle = fitted
-    path = tmp_path / "narrow.npz"
-    np.savez(path, names=np.array(["a"]), vectors=np.ones((1, 5), np.float32), feature_space=np.array(FEATURE_SPACE))
-    error = error_of(capsys, "segment", bundle, "--text-features", path)
-    assert "width 5" in error
-    assert str(FEATURE_WIDTH) in error
-
-
-@pytest.mark.parametrize("damage", ["truncated", "foreign"])
-def test_bad_bundles_are_refused(damage, fitted, tmp_path, capsys):
-    path = tmp_path / "bad.ogpc"
-    data = fitted[1].read_bytes()
-    path.write_bytes(data[: len(data) // 2] if damage == "truncated" else b"not a bundle at all")
-    for command in ("segment", "info"):
-        assert "bad.ogpc" in error_of(capsys, command, path)
-
-
 def test_segment_knows_the_endings_that_results_are_saved_with():
     assert cli_segment.SAVED_AS == SAVED_AS
 
@@ -326,13 +270,6 @@ def test_a_command_out_of_memory_is_one_line(fitted, capsys, monkeypatch):
 
     monkeypatch.setattr("og_pointcloud.segment", fail)
     assert error_of(capsys, "segment", fitted[1]) == "error: out of memory"
-
-
-def test_unknown_and_repeated_labels(fitted, capsys):
-    _, bundle = fitted
-    assert "did you mean 'red ball'" in error_of(capsys, "segment", bundle, "--labels", "red bal")
-    assert "twice" in error_of(capsys, "segment", bundle, "--labels", "lamp,lamp")
-    assert "0 labels" in error_of(capsys, "segment", bundle, "--labels", " , ")
 
 
 def views_of(capture):

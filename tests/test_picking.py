@@ -248,8 +248,3 @@ hit = og.pick(scene, (x, y, z))
 assert hit.instance == 5 and hit.mask(camera).any() and len(hit.words()) == 5
 """
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "room.ogpc")], check=True, timeout=60)
-
-
-def test_unknown_scenes_are_refused():
-    with pytest.raises(OgPointcloudError, match="scene is a int"):
-        pick(3, (0, 0, 0))

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from commands import error_of
 from scenes import COLOURS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
@@ -276,11 +277,8 @@ def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
 
 
 def test_bad_use_is_one_error(tmp_path, capsys):
-    one = str(tmp_path)
-    for options, text in (([one, "--knob", "colour"], "'colour' is no knob"),):
-        assert main(["report", *options]) == 2
-        assert text in capsys.readouterr().err
-    (tmp_path / "a" / "x").mkdir(parents=True)
-    (tmp_path / "b" / "x").mkdir(parents=True)
-    assert main(["report", str(tmp_path / "a" / "x"), str(tmp_path / "b" / "x"), "-o", str(tmp_path / "r")]) == 2
-    assert "two captures are in folders named 'x'" in capsys.readouterr().err
+    assert "'colour' is no knob" in error_of(capsys, "report", tmp_path, "--knob", "colour")
+    for name in "ab":
+        (tmp_path / name / "x").mkdir(parents=True)
+    error = error_of(capsys, "report", tmp_path / "a" / "x", tmp_path / "b" / "x", "-o", tmp_path / "r")
+    assert "two captures are in folders named 'x'" in error

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import error_of
 from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
 
@@ -123,23 +124,18 @@ def test_the_legend_has_the_colors_of_the_points(viser):
 )
 def test_bad_use_is_refused_in_one_line(viser, bundle, capsys, monkeypatch, options, said):
     monkeypatch.chdir(bundle.parent)
-    assert main(["serve", str(bundle), *options]) == 2
-    stderr = capsys.readouterr().err
-    assert said in stderr
-    assert len(stderr.splitlines()) == 1
+    assert said in error_of(capsys, "serve", bundle, *options)
 
 
 def test_an_empty_scene_is_refused(viser, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
-    assert main(["serve", str(empty)]) == 2
-    assert "empty has no point to show" in capsys.readouterr().err
+    assert "empty has no point to show" in error_of(capsys, "serve", empty)
 
 
 def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
     monkeypatch.delitem(sys.modules, "og_pointcloud.show.serve", raising=False)
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert main(["serve", str(bundle)]) == 2
-    assert "og-pointcloud[serve]" in capsys.readouterr().err
+    assert "og-pointcloud[serve]" in error_of(capsys, "serve", bundle)
     with pytest.raises(og.MissingExtraError, match="serve"):
         og.load(bundle).show()
 
@@ -265,8 +261,7 @@ def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, viser
     main(["serve", friday, "--before", monday, "--port", "0"])
     assert "since monday: 1 gone, 1 new, 1 moved, 0 not seen again" in capsys.readouterr().out
     for more, says in (([friday], "--before is for one scene"), (["--cloud", "c.ply"], "expected one")):
-        assert main(["serve", friday, *more, "--before", monday]) != 0
-        assert says in capsys.readouterr().err
+        assert says in error_of(capsys, "serve", friday, *more, "--before", monday)
 
 
 def test_the_page_of_changes_calls_nothing_unknown_that_is_as_it_was(visits_of_a_place, tmp_path):

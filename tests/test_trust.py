@@ -749,6 +749,10 @@ def test_memory_is_flat_over_frames_of_many_sizes(bundle):
     before = resident()
     stream(bundle, range(1, 1501))
     assert resident() - before < 5 << 20  # 7 kB a size is 10 MB
+    tracemalloc.start()
+    stream(bundle, range(100, 700))
+    assert tracemalloc.get_traced_memory()[0] < 50_000
+    tracemalloc.stop()
 
 
 @pytest.mark.slow

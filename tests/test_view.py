@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import error_of, run
 from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
 from scenes import write_ply
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
@@ -36,15 +36,6 @@ def content(page):
         if data[name]:
             data[name] = np.frombuffer(zlib.decompress(base64.b64decode(data[name])), kind)
     return data
-
-
-def run(capsys, *arguments):
-    try:
-        code = main([str(argument) for argument in arguments])
-    except SystemExit as leaving:
-        code = leaving.code
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
 
 
 def test_the_page_holds_what_segment_answers(bundle, tmp_path, capsys):
@@ -138,9 +129,7 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
     assert code == 0
     assert "none of 5 points has a label: 5 are too far from the scene" in stderr
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
-    code, _, stderr = run(capsys, "view", empty, "--html", tmp_path / "empty.html")
-    assert code == 2
-    assert "has no point to show" in stderr
+    assert "has no point to show" in error_of(capsys, "view", empty, "--html", tmp_path / "empty.html")
     assert not (tmp_path / "empty.html").exists()
 
 
@@ -157,10 +146,7 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
 )
 def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, options, said):
     monkeypatch.chdir(tmp_path)
-    code, _, stderr = run(capsys, "view", bundle, *options)
-    assert code == 2
-    assert said in stderr
-    assert len(stderr.splitlines()) == 1
+    assert said in error_of(capsys, "view", bundle, *options)
     assert list(tmp_path.iterdir()) == []
 
 
