@@ -295,6 +295,15 @@ def test_points_that_may_be_missing_by_chance_prove_nothing(monday, through, lac
     assert np.flatnonzero(sure).tolist() == np.flatnonzero(left & surely).tolist()
 
 
+def test_a_visit_compared_with_itself_has_nothing_to_say(monday):
+    """Nor of an instance with fewer points than decide anything, nor of one that its own views do not see."""
+    ids, xyz = monday.instance_ids.copy(), monday.xyz.copy()
+    ids[np.flatnonzero(ids == instance_of(monday, BIN))[2:]] = -1
+    xyz[ids == instance_of(monday, CRATE), 2] -= 2  # below the floor
+    odd = replace(monday, instance_ids=ids, xyz=xyz)
+    assert str(og.compare(odd, odd)) == "0 gone, 0 new, 0 moved, 0 not seen again"
+
+
 @pytest.mark.slow
 def test_what_the_first_visit_never_looked_at_is_not_new(monday):
     """Monday only looked from one side; behind the chest stands something that it could not see."""

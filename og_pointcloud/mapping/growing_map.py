@@ -6,13 +6,15 @@ surface: points that lie behind it are hidden.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthImage
 from og_pointcloud.formats.fusion import on_surface, to_world
 from og_pointcloud.formats.poses import in_local_frame
@@ -152,6 +154,7 @@ class GrowingMap:
         for stamp, pose in poses.items():
             camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose))
             corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
+        self._warn_of_strange(corrected.keys())
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:
                 # A point keeps its place in the frame of its camera: out of the old pose, into the corrected one.
@@ -168,6 +171,20 @@ class GrowingMap:
             self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
         # Snapshots are remembered by the sequence: they are made anew after a correction.
         self.count(self.stamp)
+
+    def _warn_of_strange(self, stamps: Collection[float]) -> None:
+        """Warn of stamps of no frame, or, where all are such, SceneError: seconds were taken for nanoseconds, say."""
+        known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
+        # Of frames before the recent ones only some are remembered.
+        since = min(self.recent) if len(self.recent) == RECENT_FRAMES else -np.inf
+        strange = [stamp for stamp in stamps if stamp not in known and stamp >= since]
+        some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
+        if strange and len(strange) == len(stamps):
+            there = f", {min(known):.15g} to {max(known):.15g}" if known else ""
+            raise SceneError(f"the poses' stamps are {some}; expected those of frames that were integrated{there}")
+        if strange:
+            what = f"{len(strange)} of {len(stamps)} poses are of no frame that was integrated: {some}"
+            warnings.warn(what, stacklevel=4)
 
     def count(self, stamp: float) -> None:
         """One more frame is in."""

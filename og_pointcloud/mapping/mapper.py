@@ -244,13 +244,15 @@ class Mapper:
         coordinates.
 
         Points move with the frame that brought them, kept views with theirs; the points of a known cloud stay.
-        SceneError for what is no pose; then nothing moves.
+        SceneError for what is no pose, and where no stamp is that of a frame; then nothing moves. Where some are, a
+        warning names those that are not, as of frames that were refused.
         """
         if not isinstance(poses, Mapping):
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
-        if self._map is not None:
-            self._map.correct(poses)
-            self._around = None
+        if self._map is None:
+            raise SceneError("no frame was integrated yet, so there is nothing to correct: integrate some first")
+        self._map.correct(poses)
+        self._around = None
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
         """The frame, and the map that it goes into: an empty one where there is none yet."""

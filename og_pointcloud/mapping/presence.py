@@ -214,7 +214,8 @@ class Evidence:
     def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
         """(instances,) bool each: those that likely left, being seen through, and by more than the other cloud leaves
         out of all that stands near them; those of them that surely did, as this is no accident; and those of which
-        nothing is known: hardly looked at, or left out no more than all near them.
+        nothing is known: hardly looked at, unless all that was seen is measured again, or left out no more than all
+        near them.
 
         Each point counts by how sure it is of its instance: a part of the table that masks took for the book's must not
         keep the book there when it leaves.
@@ -238,7 +239,9 @@ class Evidence:
         share = self._left_out_about(visit, left)
         likely = left & (seen_through > share * looked_at)
         surely = likely & (bdtrc(seen_through - 1, looked_at.astype(int), share) < CHANCE)
-        return likely, surely, (looked_at < least) | (left & ~likely)
+        # Where all points that were seen are measured again, even few of them, or none, leave no doubt.
+        again = visit.count(self.shown & self.still) == visit.count(self.shown)
+        return likely, surely, ((looked_at < least) & ~again) | (left & ~likely)
 
     def _left_out_about(self, visit: Visit, left: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(instances,) for those that may have left, the share that the other visit's cloud leaves out of what still
