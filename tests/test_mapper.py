@@ -156,7 +156,7 @@ def test_a_loop_closure_moves_what_its_frames_brought():
     with pytest.raises(SceneError, match="poses are a list; expected a dict"):
         mapper.correct([np.eye(4)])
     before, pose = mapper._map.points.xyz.copy(), given[0].camera.world_to_camera
-    with pytest.raises(SceneError, match="stamps are 100, 101; expected those of frames .*, 0 to 13"):
+    with pytest.raises(SceneError, match=r"stamps are 100, 101; expected those of frames .*, 0 to 13"):
         mapper.correct({100.0: pose, 101.0: pose})
     with pytest.raises(SceneError, match="no frame was integrated yet"):
         og.Mapper().correct({0.0: pose})
