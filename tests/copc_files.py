@@ -1,4 +1,4 @@
-"""A COPC file made to its specification (copc.io, version 1.0), which neither laspy nor lazrs writes."""
+"""A COPC file made to its specification (copc.io, version 1.0), which neither laspy nor lazrs writes; LAS labels."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ import numpy as np
 HEADER, RECORD_HEADER, INFO = 375, 54, 160
 POINT_FORMAT, POINT_BYTES = 7, 36
 """Three 32-bit counts to a point, times, and colours of 16 bits."""
+
+
+def attributes_of(labels: list[int] | np.ndarray) -> dict[str, np.ndarray]:
+    """What `write_las` stores of points of these labels, each an instance of its number."""
+    labels = np.asarray(labels, np.int32)
+    scores, reasons = np.ones(len(labels), np.float32), (labels < 0).astype(np.uint8)
+    return {"og_label": labels, "og_instance": labels, "og_score": scores, "og_reason": reasons}
 
 
 def write_copc(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:

@@ -25,17 +25,33 @@ def members_of(path: Path) -> dict[str, bytes]:
         return {info.filename: archive.read(info) for info in archive.infolist()}
 
 
-def forged(source: Path, path: Path, changes: dict[str, bytes], edit: Callable[[dict], Any] = lambda _: None) -> Path:
-    """A .ogpc with some members replaced or added, and a manifest that declares them."""
-    members = members_of(source) | changes
-    manifest = json.loads(members.pop("manifest.json"))
-    for name, data in members.items():
-        manifest["members"].setdefault(name, {})["bytes"] = len(data)
-    edit(manifest)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in {"manifest.json": json.dumps(manifest).encode(), **members}.items():
-            archive.writestr(zipfile.ZipInfo(name), data)
+def zip_of(path: Path, members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> Path:
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(zipfile.ZipInfo(name), data, compression)
     return path
+
+
+Change = Callable[[dict, dict[str, bytes]], Any]
+
+
+def changed(source: Path, path: Path, change: Change, *, declares: bool = True) -> Path:
+    """A .ogpc in which change(manifest, members) was made. declares: its manifest says how long all members are now."""
+    members = members_of(source)
+    manifest = json.loads(members.pop("manifest.json"))
+    change(manifest, members)
+    for name, data in members.items() if declares and isinstance(manifest["members"], dict) else ():
+        manifest["members"].setdefault(name, {})["bytes"] = len(data)
+    return zip_of(path, {"manifest.json": json.dumps(manifest).encode(), **members})
+
+
+def drop(name: str) -> Change:
+    return lambda manifest, members: (members.pop(name), manifest["members"].pop(name))
+
+
+def forged(source: Path, path: Path, changes: dict[str, bytes], edit: Callable[[dict], Any] = lambda _: None) -> Path:
+    """A .ogpc with some members replaced or added, and an edited manifest that declares them."""
+    return changed(source, path, lambda manifest, members: (members.update(changes), edit(manifest)))
 
 
 # Graphs of a .ogpc: each takes the graph of an onnx model and changes it ----------------------------------------------

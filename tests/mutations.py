@@ -323,11 +323,12 @@ MUTATIONS = (
     ),
     Mutation(
         "two runs in one folder", "formats/atomic.py",
-        "if not _hold(file):", "if not file:", trust("one_run_at_a_time_in_a_folder"),
+        "if not _hold(file):", "if not file:", ("test_memory.py::test_only_one_run_at_a_time",),
     ),
     Mutation(
         "foreign text as it is", "errors.py",
-        "s if s.isprintable() else repr(s)[1:-1]", "s", trust("printable"),
+        "s if s.isprintable() else repr(s)[1:-1]", "s",
+        ("test_fuzz.py::test_messages_are_printable_whatever_the_file_says",),
     ),
     Mutation(
         "results as they are", "cli/__init__.py",

@@ -5,7 +5,6 @@ import shutil
 import struct
 import sys
 import warnings
-import zipfile
 import zlib
 from pathlib import Path
 
@@ -491,48 +490,6 @@ def test_truncated_mask_and_image(capture):
         scene.views[1].mask_map()
     with pytest.raises(SceneError, match=r"images/frame_01.png \(60 bytes\) cannot be decoded"):
         scene.views[1].image_rgb()
-
-
-def hostile_npz(file, names, payload):
-    with zipfile.ZipFile(file, "w") as archive:
-        for name in names:
-            archive.writestr(f"{name}.npy", payload)
-
-
-def npy(shape, descr="<f4", data=b""):
-    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + data
-
-
-@pytest.mark.parametrize(
-    ("payload", "message"),
-    [
-        (npy((10**9, 10**9)), "claims float32 .*1000000000.* bytes, but 0 follow"),
-        (npy((2,), "|O", b"cposix\nsystem\n."), "Python objects"),
-        (npy((2, 8), data=b"\0" * 63), "claims float32"),
-        (b"garbage", "cannot be read as an .npz of plain arrays"),
-        (b"", "cannot be read as an .npz of plain arrays"),
-    ],
-)
-def test_hostile_features_are_refused(capture, payload, message):
-    folder, world = capture
-    hostile_npz(folder / "mask_features.npz", world.names, payload)
-    with pytest.raises(SceneError, match=message):
-        read_capture(folder)
-
-
-def test_damaged_features_are_refused(capture):
-    folder, _ = capture
-    file = folder / "mask_features.npz"
-    whole = file.read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 3):
-        file.write_bytes(whole[:size])
-        with pytest.raises(SceneError, match=r"mask_features.npz: it cannot be read as an .npz of plain arrays"):
-            read_capture(folder)
-    broken = bytearray(whole)
-    broken[200] ^= 0xFF
-    file.write_bytes(bytes(broken))
-    refused(folder, r"cannot be read as an .npz of plain arrays .*CRC")
 
 
 def test_damaged_compressed_features_are_refused(capture):

@@ -298,9 +298,3 @@ def test_weights_by_instance_are_a_product_with_indicators() -> None:
     cluster = np.random.default_rng(0).integers(-1, 5, table.weights.shape[1]).astype(np.int32)
     onehot = (cluster[:, None] == np.arange(5)).astype(float)
     np.testing.assert_allclose(weights_by_instance(table.weights, cluster, 5), table.weights.toarray() @ onehot)
-
-
-def test_bad_settings_are_refused() -> None:
-    for bad in ({"k1": 0}, {"k2": -1}, {"levels": 3}):
-        with pytest.raises(OgPointcloudError, match=f"{next(iter(bad))} is"):
-            CodebookSettings(**bad)

@@ -13,7 +13,7 @@ from reference_splatting import pixel_weights
 from scenes import TinyCapture
 from scipy.sparse import csr_array, random_array, vstack
 
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.learned import instance_features as features
 from og_pointcloud.fitting.learned.instance_features import (
@@ -257,16 +257,3 @@ def test_masks_that_show_nothing_are_refused() -> None:
     empty = replace(scene.table, weights=csr_array(scene.table.weights.shape, dtype=np.float32))
     with pytest.raises(SceneError, match="none of the 11 masks shows a Gaussian"):
         learn_features(empty)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"width": 0}, "width is 0"),
-        ({"intra": False, "inter": False}, "both losses are off"),
-        ({"cohesion_weight": -1.0}, "cohesion_weight is -1"),
-    ],
-)
-def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> None:
-    with pytest.raises(OgPointcloudError, match=message):
-        FeatureSettings(**options)

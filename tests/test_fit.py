@@ -18,6 +18,8 @@ from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import (
+    CodebookSettings,
+    FeatureSettings,
     FitSettings,
     GeometrySettings,
     GroupingSettings,
@@ -428,6 +430,10 @@ def test_masks_that_show_no_point_are_refused(mode: str) -> None:
         (lambda: FitSettings(seed=True), "seed is True; expected a whole number from 0"),
         (lambda: FitSettings(membership=None), r"membership is None; expected a MembershipSettings \(FitSettings\)"),  # type: ignore[arg-type]
         (lambda: MatchingSettings(relative="no"), "relative is 'no'; expected a bool, by default False"),  # type: ignore[arg-type]
+        (lambda: CodebookSettings(k1=0), "k1 is 0; expected a whole number above 0"),
+        (lambda: FeatureSettings(width=-1), "width is -1; expected a whole number above 0"),
+        (lambda: FeatureSettings(intra=False, inter=False), "both losses are off"),
+        (lambda: PaperSettings(schedule_share=0.0), "schedule_share is 0.0; expected a finite number above 0"),
     ],
 )  # fmt: skip
 def test_settings_that_mean_nothing_are_refused(settings: Callable[[], object], message: str) -> None:

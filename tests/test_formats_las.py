@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from copc_files import write_copc
+from copc_files import attributes_of, write_copc
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.las import write_las
@@ -16,10 +16,8 @@ from og_pointcloud.formats.points import read_points
 
 def labelled(path: Path) -> bytes:
     """Twelve labelled points as the library writes them."""
-    ids = np.zeros(12, np.int32)
-    attributes = {"og_label": ids, "og_instance": ids, "og_score": np.ones(12, np.float32)}
-    attributes["og_reason"] = np.zeros(12, np.uint8)
-    write_las(path, np.random.default_rng(0).normal(size=(12, 3)), np.full((12, 3), 99, np.uint8), attributes, ("a",))
+    xyz, rgb = np.random.default_rng(0).normal(size=(12, 3)), np.full((12, 3), 99, np.uint8)
+    write_las(path, xyz, rgb, attributes_of([0] * 12), ("a",))
     return path.read_bytes()
 
 
@@ -97,13 +95,7 @@ def test_copc_is_read_like_any_laz(tmp_path):
     points = read_points(tmp_path / "a.copc.laz")
     np.testing.assert_allclose(points.xyz_world, xyz, atol=1e-4)
     np.testing.assert_array_equal(points.rgb, rgb)
-    label = np.zeros(900, np.int32)
-    labels = {
-        "og_label": label,
-        "og_instance": label,
-        "og_score": label + np.float32(1),
-        "og_reason": label.astype("u1"),
-    }
+    labels = attributes_of([0] * 900)
     write_las(tmp_path / "labelled.laz", points.xyz_world, rgb, labels, ("bush",), tmp_path / "a.copc.laz")
     found = laspy.read(tmp_path / "labelled.laz")  # an octree of chunks that are elsewhere now would be read
     assert "copc" not in {record.user_id for record in (*found.vlrs, *(found.evlrs or ()))}
@@ -130,9 +122,7 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     angle, step = ("scan_angle_rank", 1) if point_format < 6 else ("scan_angle", 0.006)  # degrees, as LAS 1.2 and 1.4
     survey[angle] = np.arange(count) * 15 - 90
     survey.write(tmp_path / "survey.laz")
-    label = np.where(np.arange(count) < 5, 0, -1).astype(np.int32)
-    attributes = {"og_label": label, "og_instance": label, "og_score": np.ones(count, np.float32)}
-    attributes["og_reason"] = (label < 0).astype(np.uint8)
+    attributes = attributes_of(np.where(np.arange(count) < 5, 0, -1))
     points, gray, path = read_points(tmp_path / "survey.laz"), np.zeros((count, 3), np.uint8), tmp_path / "labelled.laz"
     write_las(path, points.xyz_world, gray, attributes, ("bush",), tmp_path / "survey.laz")
     found = laspy.read(path)
@@ -141,15 +131,11 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
             assert np.array_equal(found[field], survey[field]), field
     assert np.array_equal(found.scan_angle * 0.006, np.asarray(survey[angle]) * step)
     assert found.classification.tolist() == [64] * 5 + [2] * 4 + [30] * 3
-    assert found.og_label.tolist() == label.tolist()
+    assert found.og_label.tolist() == attributes["og_label"].tolist()
     assert [record.user_id for record in found.vlrs].count("og_pointcloud") == 1
     assert found.vlrs.get_by_id("LASF_Projection")[0].record_data_bytes() == b'PROJCS["site"]\0'
     assert found.evlrs.get_by_id("surveyor")[0].record_data_bytes() == b"a" * 70_000
-    nothing = {
-        name: np.full_like(values, -1 if name in ("og_label", "og_instance") else 1)
-        for name, values in attributes.items()
-    }
-    write_las(path, points.xyz_world, gray, nothing, ("tree",), path)  # no bush of the first run is a tree
+    write_las(path, points.xyz_world, gray, attributes_of([-1] * count), ("tree",), path)  # no bush is a tree now
     again = laspy.read(path)
     assert again.classification.tolist() == [1] * 5 + [2] * 4 + [30] * 3
     assert [record.user_id for record in again.vlrs].count("og_pointcloud") == 1

@@ -165,6 +165,7 @@ LITTLE = "ply\nformat binary_little_endian 1.0\n"
         (LITTLE + "element vertex 3\n", "has no properties"),
         (LITTLE + VERTEX + VERTEX, "element 'vertex' is declared twice"),
         (LITTLE + VERTEX + "property float x\n", "has property 'x' twice"),
+        (LITTLE + VERTEX + "".join(f"property uchar p{k}\n" for k in range(12_000)), "more than 1024 properties"),
         (LITTLE + VERTEX + "property quad y\n", "unknown type 'quad'; expected one of char, uchar"),
         (LITTLE + VERTEX + "property list uchar y\n", "expected a type and a name"),
         (LITTLE + VERTEX + "property float\n", "expected a type and a name"),

@@ -86,11 +86,6 @@ def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, conte
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(SceneError, match=r"none\.ply: No such file"):
-        read_points(tmp_path / "none.ply")
-
-
 def test_no_points_nan_and_missing_columns_name_the_file_once(tmp_path):
     broken = XYZ.copy()
     broken[[3, 9], 1] = np.nan

@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from copc_files import write_copc
+from copc_files import attributes_of, write_copc
 from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
 from hostile_files import SEEDS, UNKNOWN_GRAPHS, with_graph
 from hypothesis import HealthCheck, given, settings
@@ -98,10 +98,7 @@ def _pcd(folder: Path) -> list[bytes]:
 
 def _las(folder: Path) -> list[bytes]:
     pytest.importorskip("laspy")
-    ids = np.zeros(12, np.int32)
-    attributes = {"og_label": ids, "og_instance": ids, "og_score": np.ones(12, np.float32)}
-    attributes["og_reason"] = np.zeros(12, np.uint8)
-    write_las(folder / "made.las", _xyz(), np.full((12, 3), 99, np.uint8), attributes, ("chair",))
+    write_las(folder / "made.las", _xyz(), np.full((12, 3), 99, np.uint8), attributes_of([0] * 12), ("chair",))
     return [(folder / "made.las").read_bytes()]
 
 

@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile_files import forged
 from labelled_clouds import room
 from numpy.typing import NDArray
 from og_pointcloud_export import write_bundle
-from test_bundle import changed, npy
 from test_grouping import ONE, OTHER, HandView, hand_table
 
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.fitting.association import part_of
+from og_pointcloud.formats.npy import npy_bytes
 
 MUG, HANDLE, TABLE = range(60), range(60, 80), range(80, 200)
 IDS = np.repeat([0, 1, 2], [60, 20, 120]).astype(np.int32)
@@ -219,7 +220,5 @@ def test_the_hierarchy_comes_back_from_its_file(tmp_path: Path) -> None:
 def test_files_with_a_damaged_hierarchy_are_refused(tmp_path: Path) -> None:
     file = write_bundle(room(200), tmp_path / "room.ogpc")
     for bad, says in ((np.arange(9, dtype=np.int32), "a part of itself"), (np.zeros(8, np.int32), "whole.npy")):
-        put = npy(bad)
-        path = changed(file, tmp_path / "bad.ogpc", lambda _, members, data=put: members.update({WHOLE: data}))
         with pytest.raises(BundleError, match=says):
-            read_bundle(path)
+            read_bundle(forged(file, tmp_path / "bad.ogpc", {WHOLE: npy_bytes(bad)}))

@@ -388,15 +388,6 @@ def test_a_view_with_one_mask_has_no_separation() -> None:
     assert separation.item() == 0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"k1": 0}, "k1 is 0"), ({"schedule_share": 0.0}, "schedule_share is 0"), ({"width": -1}, "width is -1")],
-)
-def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> None:
-    with pytest.raises(OgPointcloudError, match=message):
-        PaperSettings(**options)
-
-
 def test_missing_torch_names_the_extra() -> None:
     code = "import sys; sys.modules['torch'] = None; import og_pointcloud.fitting.learned.paper"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

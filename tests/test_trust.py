@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gzip
 import importlib
 import itertools
 import json
@@ -23,6 +22,7 @@ from pathlib import Path
 import benchmark_stream
 import numpy as np
 import pytest
+from copc_files import attributes_of
 from hostile_files import (
     UNBOUNDED_TOKENIZERS,
     UNKNOWN_GRAPHS,
@@ -47,9 +47,8 @@ from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
 from og_pointcloud.cli.common import write_json
 from og_pointcloud.cloud import TOO_FAR
-from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError, printable
-from og_pointcloud.formats import spz
-from og_pointcloud.formats.atomic import LOCK, locked, replacing, replacing_folder
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import locked, replacing, replacing_folder
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
@@ -257,20 +256,10 @@ def test_a_name_too_long_for_any_file_is_a_missing_image(tiny_capture):
         assert len(og.read_capture(tiny_capture.folder).views) == 6
 
 
-def test_a_ply_of_thousands_of_properties(tmp_path):
-    properties = b"".join(b"property uchar p%d\n" % k for k in range(12_000))
-    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + properties + b"end_header\n"
-    (tmp_path / "a.ply").write_bytes(header + bytes(12_000))
-    with pytest.raises(SceneError, match="more than 1024 properties"):
-        read_points(tmp_path / "a.ply")
-
-
 @pytest.mark.parametrize("scale", [0.0, -1e-4, float("nan")])
 def test_a_las_file_whose_scales_collapse_or_mirror_it(tmp_path, scale):
     pytest.importorskip("laspy")
-    attributes = {name: np.zeros(9, kind) for name, kind in (("og_label", "i4"), ("og_instance", "i4"))}
-    attributes |= {"og_score": np.ones(9, np.float32), "og_reason": np.zeros(9, np.uint8)}
-    write_las(tmp_path / "a.las", np.eye(9)[:, :3], np.zeros((9, 3), np.uint8), attributes, ("chair",))
+    write_las(tmp_path / "a.las", np.eye(9)[:, :3], np.zeros((9, 3), np.uint8), attributes_of([0] * 9), ("chair",))
     data = bytearray((tmp_path / "a.las").read_bytes())
     data[131:155] = struct.pack("<3d", scale, 1e-3, 1e-3)
     (tmp_path / "a.las").write_bytes(data)
@@ -333,12 +322,6 @@ def test_cells_of_tables_are_no_formulas(rude, tmp_path):
     assert '"=cmd' not in text
 
 
-def test_printable():
-    assert printable("mug \U0001f44d") == "mug \U0001f44d"
-    assert printable("\x1b\ud800\u202e\n") == "\\x1b\\ud800\\u202e\\n"
-    assert printable("\x1b" * 10**7, 20) == "\\x1b\\x1b\\x1b\\x1b\\..."
-
-
 # Files that are written, folders that are worked in -------------------------------------------------------------------
 
 
@@ -390,12 +373,6 @@ def test_what_killed_runs_left_is_removed_and_what_others_write_is_not(tmp_path)
     assert (tmp_path / "f[1]").read_bytes() == b"whole"
 
 
-def test_a_full_disk_is_told_with_the_path(tmp_path):
-    with pytest.raises(OSError, match=r"No space left.*s\.ply"), replacing(tmp_path / "s.ply"):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("command", ["segment -o s.ply", "view --html s.html"])
 def test_a_disk_that_is_full_while_a_command_writes(bundle, tmp_path, capsys, monkeypatch, command):
     resource = pytest.importorskip("resource")
@@ -423,18 +400,6 @@ def test_a_folder_is_whole_or_not_there(tmp_path):
     assert [path.name for path in tmp_path.rglob("*")] == ["bag", "bag.mcap"]
 
 
-def test_one_run_at_a_time_in_a_folder(tmp_path):
-    with locked(tmp_path / "work"):
-        with (
-            pytest.raises(OgPointcloudError, match=f"in use by process {os.getpid()}, since"),
-            locked(tmp_path / "work"),
-        ):
-            pass
-        assert (tmp_path / "work" / LOCK).exists(), "the second has not removed the first one's lock"
-    with locked(tmp_path / "work"):
-        pass
-
-
 def test_masks_twice_at_once(tiny_capture):
     (tiny_capture.folder / "mask_features.npz").unlink()
     shutil.rmtree(tiny_capture.folder / "masks")
@@ -451,19 +416,6 @@ def test_nothing_is_written_through_links_of_a_capture(tiny_capture, tmp_path, n
     with pytest.raises(OgPointcloudError, match="nothing is written through links"):
         make_masks(tiny_capture.folder, MaskSettings(encoder=None), progress=False, overwrite=True)
     assert list((tmp_path / "elsewhere").iterdir()) == []
-
-
-def test_masks_that_were_killed_before_they_were_put_together(tiny_capture):
-    capture = tiny_capture.folder
-    (capture / "mask_features.npz").unlink()
-    shutil.rmtree(capture / "masks")
-    (capture / "masks").write_text("in the way")
-    with pytest.raises(OSError):
-        make_masks(capture, MaskSettings(encoder=None), progress=False)
-    (capture / "masks").unlink()
-    made = make_masks(capture, MaskSettings(encoder=None), progress=False)
-    assert made.done_before == made.images == 6
-    assert not (capture / "masks.work").exists()
 
 
 def test_a_fit_that_cannot_be_written_is_kept(tiny_capture, tmp_path, capsys, monkeypatch):
@@ -719,13 +671,6 @@ def test_names_of_files_are_printed_as_text(tmp_path, capsys):
     printed = "".join(capsys.readouterr())
     assert printed.count("owned") >= 4
     assert "\x1b" not in printed
-
-
-def test_splats_that_fill_memory(tmp_path):
-    raw = spz.HEADER.pack(spz.MAGIC, 3, 1_000_000, 0, 12, 0, 0) + bytes(20_000_000)
-    (tmp_path / "a.spz").write_bytes(gzip.compress(raw) + bytes(500_000))
-    with pytest.raises(SceneError, match="made to fill memory"):
-        read_points(tmp_path / "a.spz")
 
 
 # Streams --------------------------------------------------------------------------------------------------------------

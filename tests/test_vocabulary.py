@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import zipfile
 import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hostile_files import changed, members_of
 from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, make_cloud, reference_scores, room, unit_rows
 from og_pointcloud_export import write_bundle
 from scenes import write_tiny_capture
@@ -42,11 +42,6 @@ def bundle_file(tmp_path_factory):
 def path(bundle_file, tmp_path):
     (tmp_path / "s.ogpc").write_bytes(bundle_file.read_bytes())
     return tmp_path / "s.ogpc"
-
-
-def members_of(path):
-    with zipfile.ZipFile(path) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
 
 
 def manifest_of(encoder_folder):
@@ -389,17 +384,6 @@ def test_the_writer_carries_an_encoder_too(encoder_folder, tmp_path, capsys):
     assert not (tmp_path / "o.ogpc").exists()
 
 
-def changed_zip(path, out, change):
-    members = members_of(path)
-    manifest = json.loads(members["manifest.json"])
-    change(manifest, members)
-    members["manifest.json"] = json.dumps(manifest).encode()
-    with zipfile.ZipFile(out, "w") as archive:
-        for name, data in members.items():
-            archive.writestr(name, data)
-    return out
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -412,7 +396,7 @@ def changed_zip(path, out, change):
 def test_a_carried_encoder_must_be_as_declared(path, encoder_folder, tmp_path, change, says):
     carry_encoder(path, encoder_folder)
     with pytest.raises(BundleError, match=says):
-        read_bundle(changed_zip(path, tmp_path / "t.ogpc", change))
+        read_bundle(changed(path, tmp_path / "t.ogpc", change, declares=False))
 
 
 def test_a_carried_encoder_is_checked_like_any_other(path, encoder_folder, tmp_path):
@@ -422,7 +406,7 @@ def test_a_carried_encoder_is_checked_like_any_other(path, encoder_folder, tmp_p
         name = "text_encoder/text_encoder.onnx"
         members[name] = members[name][:-1] + b"\0"
 
-    torn = changed_zip(path, tmp_path / "t.ogpc", tear)
+    torn = changed(path, tmp_path / "t.ogpc", tear)
     assert len(read_bundle(torn).cloud) == 300  # the scene itself is whole
     with pytest.raises(OgPointcloudError, match=r"t\.ogpc: text_encoder: .* was changed"):
         encoder_for(SPACE, carried_encoder(torn))
