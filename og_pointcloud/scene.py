@@ -336,6 +336,16 @@ def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
         return float(np.abs(matrix @ matrix.T - np.eye(3)).max()), float(np.linalg.det(matrix))
 
 
+def float32_step(xyz_world: NDArray[np.floating]) -> float:
+    """How far apart float32 numbers lie about most of some points (n, 3), finite ones, if all of their coordinates are
+    such numbers, as those of a map that a program kept as float32; else 0."""
+    with np.errstate(over="ignore"):
+        single = xyz_world.astype(np.float32)
+    if single.size == 0 or not np.array_equal(single, xyz_world):
+        return 0.0
+    return float(np.spacing(np.median(np.abs(single).max(axis=1))))
+
+
 def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the cloud first") -> None:
     """SceneError for points (n, 3) with NaN or infinity."""
     finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)

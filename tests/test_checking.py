@@ -25,7 +25,7 @@ from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.formats.mask_files import MaskLayer
 from og_pointcloud.formats.poses import in_local_frame, rotation_of_vector
 from og_pointcloud.formats.repairs import KINDS, Repair, read_repairs, repaired_cameras, repaired_layers
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, Points
 
 SMALL = {"views": 6, "points": 3000}
 TABLE = Path(__file__).resolve().parents[2] / "shared" / "data" / "ycb_0050"
@@ -83,6 +83,14 @@ def test_a_right_room_is_silent_and_every_check_is_made(seed):
 @pytest.mark.parametrize("options", [{"origin": (5e5, 4e6, 0), "scale": 100.0}, {"views": 3}, {"points": 1500}])
 def test_offsets_units_few_views_and_few_points_raise_no_doubt(options):
     assert doubts(tiled_room(2, **options)) == {}
+
+
+def test_map_coordinates_that_float32_rounded_are_a_doubt():
+    """A right cloud, and its cameras, of which a program has kept the cloud's coordinates as float32."""
+    room = tiled_room(2, origin=(431234.567, 5412345.678, 312.0))
+    rounded = Points.from_world(room.points.xyz_world.astype(np.float32), rgb=room.points.rgb)
+    found = doubts(with_cameras(replace(room, points=rounded), lambda cameras: cameras))["coordinates"]
+    assert "in steps of 0.5 at 5412347.0" in found.says
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(0, 4), slice(2, 5), slice(2, 4)])

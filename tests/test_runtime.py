@@ -447,6 +447,33 @@ def test_segmenter_answers_like_segment_and_warns_once(scene):
         ask(np.full((4, 3), 50.0))
 
 
+@pytest.mark.parametrize(
+    ("bring", "says"),
+    [
+        (
+            lambda xyz: xyz / 1000,
+            r"3000 are background; all of them lie within 0.00\d+, .* scene's unit",
+        ),
+        (
+            lambda xyz: xyz.astype(np.float32),
+            "so that other labels may be wrong too; float32 rounded them to steps of 0.5",
+        ),
+    ],
+)
+def test_a_cloud_of_another_unit_or_precision_that_lies_near_the_scene_is_told(scene, bring, says):
+    """Nearly all of its points are within reach of something, and get that label."""
+    origin = np.array([431234.567, 5412345.678, 312.345]) * ("float32" in says)
+    mapped = runtime.as_scene(replace(scene.cloud, origin=origin))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a detail, a few rounded places, and the scene's own points are as they may be
+        corner = mapped.xyz[np.abs(mapped.xyz - mapped.xyz[0]).max(axis=1) < 0.3]
+        og.segment(corner, ["apple", "pear"], mapped)
+        og.segment(mapped.xyz[:40].astype(np.float32), ["apple", "pear"], mapped)
+        og.segment(mapped, ["apple", "pear"])
+    with pytest.warns(UserWarning, match=says):
+        og.segment(bring(mapped.xyz), ["apple", "pear"], mapped)
+
+
 # Poses, crops, densities, noise, streams
 
 POSE = np.array([[0, -1, 0, 250.5], [1, 0, 0, -3.25], [0, 0, 1, 1e6], [0, 0, 0, 1]])

@@ -28,13 +28,18 @@ from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError, coordinate
-from og_pointcloud.scene import RIGID, rotation_error
+from og_pointcloud.scene import RIGID, float32_step, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
 ELSEWHERE_SHARE = 1 / 3
 """Where more than this share of the points asked lies too far from the scene, the two may be in different frames."""
+LOOKED_AT, FEWEST_JUDGED = 1000, 100
+"""About so many points of a cloud, evenly spread, tell whether its unit and its precision fit the scene; fewer than the
+second number say nothing."""
+WIDE = 10
+"""A scene so many times as wide as its reach is more than what a cloud within that reach would show of it."""
 POINTS_PER_RUN = 1 << 20
 """Points given to the graph at once, which keeps its memory to about 150 MB."""
 
@@ -404,18 +409,41 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
     finite = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     far = int((finite & (result.reasons == Reason.TOO_FAR)).sum())
-    place = ""
-    if far > ELSEWHERE_SHARE * finite.sum() and len(scene.cloud):
-        place = (
-            f"the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}, its reach is "
-            f"{scene.cloud.reach:.4g}: bring them into the scene's frame and unit"
-        )
+    cause = "" if result.xyz is scene.xyz else _misplaced(result.xyz[finite], far, scene)
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
-        return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {place}' if place else ''}"
-    return (
-        place and f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other labels may be wrong too; {place}"
-    )
+        return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
+    seen = f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other" if far else f"the {len(result)} points'"
+    return cause and f"{seen} labels may be wrong{' too' if far else ''}; {cause}"
+
+
+def _misplaced(points: NDArray[np.float64], far: int, scene: LabelledScene) -> str:
+    """Why points, all finite, may not lie where the scene has them, "" if nothing says so. far: how many are too far
+    from it."""
+    if len(scene.cloud) == 0:
+        return ""
+    some = points[:: 1 + len(points) // LOOKED_AT]
+    many, spacing, reach = len(some) >= FEWEST_JUDGED, scene.cloud.spacing, scene.cloud.reach
+    if many and (step := float32_step(some)) > spacing:
+        return (
+            f"float32 rounded them to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give them as "
+            "float64, or take an offset off before they become float32, and give it in pose="
+        )
+    if far > ELSEWHERE_SHARE * len(points):
+        return (
+            f"the points span {_box(points)}, the scene {_box(scene.xyz)}, its reach is {reach:.4g}: bring them into "
+            "the scene's frame and unit"
+        )
+    if many and (width := _width(some)) < reach < _width(scene.cloud.xyz) / WIDE:
+        return (
+            f"all of them lie within {width:.3g}, where the scene, {_width(scene.cloud.xyz):.4g} wide, has hardly two "
+            "points: bring them into the scene's unit"
+        )
+    return ""
+
+
+def _width(points: NDArray[np.floating]) -> float:
+    return float(np.ptp(points, axis=0).max())
 
 
 def _box(points: NDArray[np.float64]) -> str:

@@ -20,8 +20,8 @@ from og_pointcloud.checking.photographs import ALIKE, Photographs, read_photogra
 from og_pointcloud.checking.registration import GROUPS, MORE_POINTS, Registration, Small
 from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
-from og_pointcloud.errors import printable
-from og_pointcloud.scene import Scene
+from og_pointcloud.errors import coordinate, printable
+from og_pointcloud.scene import Points, Scene, float32_step
 
 Verdict = Literal["ok", "doubt", "unchecked"]
 
@@ -101,7 +101,7 @@ def check_capture(scene: Scene) -> list[Check]:
     if maps is not None:
         checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
         checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
-    return checks
+    return [*_coordinates(scene.points), *checks]
 
 
 def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
@@ -149,6 +149,20 @@ def _doubt(name: str, says: str, repairs: Repairs = (), then: str = "") -> Check
     """then: what is so with the repairs, if there are any."""
     listed = " ".join(map(str, repairs))
     return Check(name, "doubt", f"{says}; with {listed} {then}" if repairs else says, listed)
+
+
+def _coordinates(points: Points) -> list[Check]:
+    """A doubt where float32 rounded the coordinates of a map to more than the distance of its points."""
+    # A surface of n points is about as wide as the root of n times their distance.
+    apart = float(np.ptp(points.xyz, axis=0).max()) / float(np.sqrt(len(points)))
+    farthest = float(np.abs(points.origin).max())
+    if np.spacing(np.float32(farthest)) <= apart or (step := float32_step(points.xyz_world)) <= apart:
+        return []
+    says = (
+        f"they are float32, in steps of {step:.3g} at {coordinate(farthest)}, and points lie about {apart:.2g} apart: "
+        "export them as double, or take an offset off cloud and poses before"
+    )
+    return [Check("coordinates", "doubt", says)]
 
 
 def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:
