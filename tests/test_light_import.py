@@ -23,6 +23,10 @@ assert (result.labels >= 0).any()
 assert (og.Segmenter(scene, ["plum"])(points).labels >= 0).any()
 result.save(sys.argv[2] + "/out.npz"), result.save(sys.argv[2] + "/out.ply")
 og.read_points(sys.argv[2] + "/out.ply")
+from og_pointcloud_ros import to_detections
+message = result.to_pointcloud2()
+assert (og.segment(message, ["apple", "pear"], scene).labels == result.labels).mean() > 0.99
+assert to_detections(scene, result).detections
 """
 
 

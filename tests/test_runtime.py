@@ -363,6 +363,7 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
     assert (result.labels.dtype, result.scores.dtype, result.instances.dtype) == (np.int32, np.float32, np.int32)
     assert result.counts() == {"apple": (result.labels == 0).sum(), "pear": (result.labels == 1).sum()}
     assert (result.mask("pear") == (result.labels == 1)).all()
+    assert {type(name) for name in og.segment(scene, np.array(["apple", "pear"])).names} == {str}
     assert (result.scores[result.labels < 0] == 0).all()
     assert (result.labels[result.instances == 4] == -1).all()  # it has no descriptor
     with pytest.raises(OgPointcloudError, match="'plum' was not asked for; the labels are apple, pear"):

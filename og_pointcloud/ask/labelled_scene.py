@@ -413,8 +413,8 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
-    seen = f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other" if far else f"the {len(result)} points'"
-    return cause and f"{seen} labels may be wrong{' too' if far else ''}; {cause}"
+    others = f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other labels may be wrong too"
+    return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
 def _misplaced(points: NDArray[np.float64], far: int, scene: LabelledScene) -> str:

@@ -63,7 +63,7 @@ def resolve_labels(
 def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
     if not names:
         raise OgPointcloudError("0 labels are given; expected at least one word: name what you want to find")
-    return checked_vocabulary(names, vectors)
+    return checked_vocabulary(tuple(map(str, names)), vectors)  # of numpy's strings too
 
 
 def _ways(feature_space: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,11 @@ from og_pointcloud.ask.instances import Instances
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.mapping.map_objects import MapObject
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 from og_pointcloud_ros.pointcloud2 import UNLABELLED
+
+if TYPE_CHECKING:
+    from og_pointcloud.mapping.map_objects import MapObject
 
 
 def to_detections(
