@@ -164,6 +164,12 @@ def test_any_way_to_name_a_scene(bundle):
         og.instance_table(3)
 
 
+@pytest.mark.parametrize("words", [-1, 1.5, None, True])
+def test_words_a_row_are_counted(words):
+    with pytest.raises(og.OgPointcloudError, match=rf"words is {words}; expected how many a row names, from 0"):
+        og.instance_table(room(600), words=words)
+
+
 def test_command(bundle, tmp_path, capsys):
     assert main(["instances", str(bundle), "--up", "0,0,1", "-o", str(tmp_path / "new" / "t.csv")]) == 0
     assert capsys.readouterr().out.startswith("9 instances\nid")

@@ -1,5 +1,7 @@
 """Feature colours against their definition, and pictures against what a small scene must show in which cell."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -183,6 +185,7 @@ def test_large_views_are_shrunk_and_long_names_cut(tmp_path):
         ({}, 1, "0 stages"),
         ({"short": np.ones((5, 6))}, 1, r"'short' has shape \(5, 6\); expected 4941 rows"),
         ({"flat": np.ones(4941)}, 1, "'flat' has shape"),
+        ({"narrow": np.ones((4941, 0))}, 1, r"'narrow' has shape \(4941, 0\)"),
         ({"a": np.ones((4941, 6)), "b": np.ones((4941, 5))}, 1, "differ in shape"),
         ({"a": np.ones((4941, 6))}, 0, "4 columns of 0 views"),
     ],
@@ -192,6 +195,12 @@ def test_stages_that_do_not_fit_are_refused(stages, views, text, tmp_path):
     with pytest.raises(SceneError, match=text):
         feature_picture(gaussians, [view("a")] * views, 0.1, stages, tmp_path / "f.png")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shape", [(5, 0), (5,), (4, 3)])
+def test_features_without_a_color_are_refused(shape):
+    with pytest.raises(SceneError, match=rf"float64 {re.escape(str(shape))}, their weights \(5,\); expected numbers"):
+        feature_colors(np.ones(shape), np.ones(5))
 
 
 def test_a_training_is_drawn_stage_by_stage(tmp_path):

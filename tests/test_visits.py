@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from labelled_clouds import instance_table
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -14,6 +15,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
+from og_pointcloud.mapping.merging import joined
 from og_pointcloud.mapping.presence import Evidence, Visit
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, NOTHING, THROUGH, DiscSurface, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera
@@ -293,6 +295,23 @@ def test_points_that_may_be_missing_by_chance_prove_nothing(monday, through, lac
     left, sure, _ = Evidence(shown, still, seen_through, np.ones(len(monday), bool), left_out).decided(visit)
     assert np.flatnonzero(left).tolist() == [instance_of(monday, BIN)]
     assert np.flatnonzero(sure).tolist() == np.flatnonzero(left & surely).tolist()
+
+
+def test_what_a_visit_knows_of_its_instances_goes_into_the_map():
+    """A table (0) and its leg (1); in the visit they are 3 and 0, and a drawer (1) with its knob (2) is new."""
+    nan = np.float32("nan")
+    of_map = replace(instance_table(2), coarse=np.int32([0, 1]), part_of=np.int32([-1, 0]),
+                     reliability=np.float32([0.5, nan]))  # fmt: skip
+    of_visit = replace(instance_table(4), coarse=np.int32([0, 1, 1, -1]), part_of=np.int32([3, 3, 1, -1]),
+                       reliability=np.float32([0.25, 0.75, nan, 0.9]))  # fmt: skip
+    both = joined(of_map, of_visit, np.array([1, 2, 3, 0]), np.array([0, 1, 2, 3]))
+    assert both.part_of.tolist() == [-1, 0, 0, 2]
+    assert both.coarse.tolist() == [0, 1, 3, 3]  # behind those of the map
+    # Of both visits by their masks: 2 of the map's, 5 of the visit's.
+    np.testing.assert_allclose(both.reliability, [(2 * 0.5 + 5 * 0.9) / 7, 0.25, 0.75, nan], rtol=1e-6)
+    # Two pieces of one new thing, one of which the visit took for a part of the drawer: nothing is a part of itself.
+    both = joined(of_map, replace(of_visit, part_of=np.int32([-1, 2, 3, -1])), np.array([1, 2, 3, 2]), np.arange(4))
+    assert both.part_of.tolist() == [-1, 0, 3, -1]
 
 
 def test_a_visit_compared_with_itself_has_nothing_to_say(monday):

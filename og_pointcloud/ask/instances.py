@@ -11,6 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Integral
 from typing import Any, overload
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.errors import coordinate, printable
+from og_pointcloud.errors import OgPointcloudError, coordinate, printable
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.tables import csv_text
 
@@ -198,6 +199,8 @@ def list_instances(
     chooser: of the same cloud. labels: the words to choose among, None for none. up: (3,) direction that the oriented
     boxes stand upright on, where it is known. words: how many a row names.
     """
+    if not isinstance(words, Integral) or isinstance(words, bool) or words < 0:
+        raise OgPointcloudError(f"words is {words!r}; expected how many a row names, from 0")
     if up is not None:
         unit_up(up)  # said now, not at the first box
     # Points sorted by id, those of one id in their own order: each instance's points are one slice. Negative ids come

@@ -162,9 +162,21 @@ def joined(
     def total(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.float64]:
         return np.asarray(np.bincount(owner, np.concatenate([one, other]), count), np.float64)
 
-    # Coarse clusters and wholes of b have numbers of its own visit: its new instances go without.
     masks, none = total(a.masks, b.masks), np.full(count - len(a), -1, np.int32)
     rows, owners = _descriptors(a, b, ids_of_b, count)
+    of_a, of_b = (table.masks * np.isfinite(table.reliability) for table in (a, b))
+    known = total(of_a, of_b)
+    reliability = total(of_a * np.nan_to_num(a.reliability), of_b * np.nan_to_num(b.reliability))
+    coarse, part_of = np.concatenate([a.coarse, none]), np.concatenate([a.part_of, none])
+    for k in np.flatnonzero(ids_of_b >= len(a)):  # those of a keep theirs
+        new, above = ids_of_b[k], np.append(ids_of_b, -1)[b.part_of[k]]
+        coarse[new] = -1 if b.coarse[k] < 0 else b.coarse[k] + a.coarse.max(initial=-1) + 1  # clusters of b alone
+        # Several instances of b may be one now, of which none is a part of itself.
+        lineage = [above]
+        while lineage[-1] >= 0:
+            lineage.append(part_of[lineage[-1]])
+        if above >= 0 and new not in lineage:
+            part_of[new] = above
     return InstanceTable(
         descriptors=rows,
         descriptor_instance=owners,
@@ -173,8 +185,9 @@ def joined(
         masks=masks.astype(np.int32),
         agreement=(total(a.agreement * a.masks, b.agreement * b.masks) / np.maximum(masks, 1)).astype(np.float32),
         visible_area=total(a.visible_area, b.visible_area).astype(np.float32),
-        coarse=np.concatenate([a.coarse, none]),
-        part_of=np.concatenate([a.part_of, none]),
+        coarse=coarse,
+        part_of=part_of,
+        reliability=np.where(known > 0, reliability / np.maximum(known, 1), np.nan).astype(np.float32),
     )
 
 

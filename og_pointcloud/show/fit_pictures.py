@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, write_png
 from og_pointcloud.rendering.splatting import Gaussians, render
@@ -79,12 +80,20 @@ class FeatureColors:
 
 def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating]) -> Colors:
     """(n, 3) uint8 RGB of features (n, w), gray for points without weight (n,), which no view sees, and for NaN.
+    SceneError where the two do not fit.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
     >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, gray
     array([ 43, 212, 128], dtype=uint8)
     """
+    features, weight = numbers_of(features), numbers_of(weight)
+    fits = features.ndim == 2 and features.shape[1] and weight.shape == features.shape[:1]
+    if not fits or features.dtype.kind not in "fiu" or weight.dtype.kind not in "fiu":
+        raise SceneError(
+            f"features are {features.dtype} {features.shape}, their weights {weight.shape}; expected numbers (n, w) "
+            "and (n,)"
+        )
     colors = FeatureColors.fit(features, weight)(features)
     colors[weight <= 0] = GREY
     return colors
@@ -150,8 +159,8 @@ def _check(stages: Mapping[str, NDArray[Any]], points: int) -> None:
     if not stages:
         raise SceneError("a picture has 0 stages; expected at least one title with its values")
     for title, values in stages.items():
-        if values.ndim != 2 or len(values) != points:
-            raise SceneError(f"stage '{title}' has shape {values.shape}; expected {points} rows, one a Gaussian")
+        if values.ndim != 2 or len(values) != points or values.shape[1] == 0:
+            raise SceneError(f"stage '{title}' has shape {values.shape}; expected {points} rows of features")
     if len({values.shape for values in stages.values()}) > 1:
         shapes = ", ".join(f"{title} {values.shape}" for title, values in stages.items())
         raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colors")
