@@ -150,11 +150,11 @@ def test_masks_of_half_the_size_halve_the_views(panoramas):
     for file in (panoramas / "masks").glob("*.png"):
         write_image(file, np.ascontiguousarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[::2, ::2]))
     scene = read_capture(panoramas)
-    assert {view.camera.width for view in scene.views} == {32}
-    assert all(view.mask_map().shape == (32, 32) for view in scene.views)
+    assert {view.camera.width for view in scene.views} == {40}
+    assert all(view.mask_map().shape == (40, 40) for view in scene.views)
     image = scene.views[0].image_rgb()
     assert image is not None
-    assert image.shape == (32, 32, 3)
+    assert image.shape == (40, 40, 3)
 
 
 def test_masks_that_do_not_fit_the_panorama_are_refused(panoramas):

@@ -2,7 +2,8 @@
 
 A single view keeps the image's focal lengths and pose, and extends to the image's rim, which a view of the same size
 would crop. The faces of a cube are called front, left, right, up, down and back; those that the lens does not see are
-left out, the others are cut to what it sees. Each has as many pixels across as the image has there.
+left out, the others are cut to what it sees. A face is coarsest in its middle: there it is as sharp as the image is in
+its own, so that resampling loses no edge.
 
 Masks are taken over by nearest pixel, since ids must not be blended. A pixel that the lens never saw is NOT_SEEN, which
 is no evidence of anything, while a pixel outside every mask says that no mask is there.
@@ -110,14 +111,13 @@ _Key = tuple[str, Numbers, Numbers, Lens]
 
 
 def faces(whole: Camera, lens: Lens) -> tuple[Face, ...]:
-    """The pinhole views of an image, at its resolution. whole: size, focal lengths, principal point and pose."""
+    """The pinhole views of an image, of its focal lengths. whole: size, focal lengths, principal point and pose."""
     boxes = _boxes(_numbers(whole), lens)
     made = []
     for name, (left, top, right, bottom) in boxes.items():
         pose = whole.world_to_camera.copy()
         pose[:3] = CUBE[name or "front"] @ pose[:3]  # turned about the camera's center: the translation turns with it
-        shrunk = np.pi / 4 if name else 1.0  # a cube's face is 2 wide for an arc of pi / 2
-        fx, fy = whole.fx * shrunk, whole.fy * shrunk
+        fx, fy = whole.fx, whole.fy
         width, height = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
         made.append(Face(name, Camera(width, height, fx, fy, -left * fx, -top * fy, pose), whole, lens))
     return tuple(made)
