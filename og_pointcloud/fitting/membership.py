@@ -37,6 +37,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +60,10 @@ ENTRIES_AT_ONCE = 1 << 26
 """Entries of the votes that are sorted by point at once: half a gigabyte."""
 ROUNDS = 2
 """Times that points hear their neighbours: what one round settles, the next hears. Further ones change little."""
-_ByPoint = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
-"""(start, rows, values): votes on point g are values[start[g] : start[g + 1]], of the masks or views in rows."""
+VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
+"""A vote on a point, and the mask or view whose it is: written and read together, they share a line of memory."""
+_ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
+"""(start, votes): the votes on point g are votes[start[g] : start[g + 1]], rows ascending."""
 
 
 @dataclass(frozen=True)
@@ -400,33 +403,25 @@ def _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen):  # n
 
 
 def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
-    """Columns low to high of a matrix: (start, rows, data), rows ascending."""
-    high = matrix.shape[1] if high is None else high
-    start = _column_starts(matrix.indices, low, high)
-    rows, values = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
-    _fill_columns(matrix.indptr, matrix.indices, matrix.data, low, high, start[:-1].copy(), rows, values)
-    return start, rows, values
+    """Columns low to high of a matrix."""
+    return _columns(matrix.indptr, matrix.indices, matrix.data, low, matrix.shape[1] if high is None else high)
 
 
 @njit(cache=True)
-def _column_starts(indices, low, high):  # noqa: ANN001, ANN202
-    """(high - low + 1,) where the entries of each column begin, sorted by column."""
+def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
     start = np.zeros(high - low + 1, np.int64)
     for e in range(len(indices)):
         if low <= indices[e] < high:
             start[indices[e] - low + 1] += 1
-    return np.cumsum(start)
-
-
-@njit(cache=True)
-def _fill_columns(indptr, indices, data, low, high, place, rows, values):  # noqa: ANN001, ANN202
-    """Writes to ``rows`` and ``values``, column by column. place: where each column begins, changed meanwhile."""
+    start = np.cumsum(start)
+    place, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
     for row in range(len(indptr) - 1):
         for e in range(indptr[row], indptr[row + 1]):
             if low <= indices[e] < high:
-                p = place[indices[e] - low]
-                rows[p], values[p] = row, data[e]
-                place[indices[e] - low] = p + 1
+                vote = votes[place[indices[e] - low]]
+                vote["row"], vote["vote"] = row, data[e]
+                place[indices[e] - low] += 1
+    return start, votes
 
 
 @njit(cache=True, parallel=True)
@@ -436,8 +431,7 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
     Where views that have a mask of that group contradict it, and a smaller group is sure, that one is taken: proposers
     let a shelf swallow the book on it in half of the views; no view that knows the book shows it as shelf.
     """
-    mask_start, mask_index, mask_vote = masks
-    view_start, view_index, view_vote = views
+    (mask_start, of_mask), (view_start, of_view) = masks, views
     n = len(mask_start) - 1
     best = np.full(n, -1, np.int32)
     votes = np.zeros(n)
@@ -446,15 +440,15 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
     for g in prange(n):
         begin, end = mask_start[g], mask_start[g + 1]
         for e in range(view_start[g], view_start[g + 1]):
-            total[g] += view_vote[e]
+            total[g] += of_view[e].vote
         sure, of_sure, asked_sure = -1, 0.0, 0.0
         for e in range(begin, end):
-            k = group[mask_index[e]]
+            k = group[of_mask[e].row]
             if k < 0 or not allowed[k]:
                 continue
             # A point lies in few masks: the votes of all masks of a group are added up at the first of them.
             before = begin
-            while before < e and group[mask_index[before]] != k:
+            while before < e and group[of_mask[before].row] != k:
                 before += 1
             if before < e:
                 continue
@@ -462,12 +456,12 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
             # as far as their masks of it are complete.
             of_group, asked = 0.0, 0.0
             for other in range(e, end):
-                mask = mask_index[other]
+                mask = of_mask[other].row
                 if group[mask] == k:
-                    of_group += mask_vote[other]
-                    asked += (1 - completeness[k, mask_view[mask]]) * mask_vote[other]
+                    of_group += of_mask[other].vote
+                    asked += (1 - completeness[k, mask_view[mask]]) * of_mask[other].vote
             for view in range(view_start[g], view_start[g + 1]):
-                asked += completeness[k, view_index[view]] * view_vote[view]
+                asked += completeness[k, of_view[view].row] * of_view[view].vote
             if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
                 best[g], votes[g], possible[g] = k, of_group, asked
             if of_group > sure_share * asked and (of_group > of_sure or (of_group == of_sure and k < sure)):
@@ -480,8 +474,7 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
 @njit(cache=True, parallel=True)
 def _share_openly(masks, views, group, mask_view, completeness, best):  # noqa: ANN001, ANN202
     """(n,) `_Support.share_openly` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
-    mask_start, mask_index, mask_vote = masks
-    view_start, view_index, view_vote = views
+    (mask_start, of_mask), (view_start, of_view) = masks, views
     share = np.zeros(len(best))
     for g in prange(len(best)):
         if best[g] < 0:
@@ -489,13 +482,13 @@ def _share_openly(masks, views, group, mask_view, completeness, best):  # noqa: 
         e, of_group, asked = mask_start[g], 0.0, 0.0
         for view in range(view_start[g], view_start[g + 1]):
             inside = 0.0
-            while e < mask_start[g + 1] and mask_view[mask_index[e]] <= view_index[view]:
-                if group[mask_index[e]] == best[g]:
-                    inside += mask_vote[e]
+            while e < mask_start[g + 1] and mask_view[of_mask[e].row] <= of_view[view].row:
+                if group[of_mask[e].row] == best[g]:
+                    inside += of_mask[e].vote
                 e += 1
-            of_group += inside * view_vote[view]
-            complete = completeness[best[g], view_index[view]]
-            asked += (inside + complete * (view_vote[view] - inside)) * view_vote[view]
+            of_group += inside * of_view[view].vote
+            complete = completeness[best[g], of_view[view].row]
+            asked += (inside + complete * (of_view[view].vote - inside)) * of_view[view].vote
         share[g] = of_group / asked if asked > 0 else 0.0
     return share
 
