@@ -266,7 +266,7 @@ def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     poses.write_bytes(b"\xef\xbb\xbf" + poses.read_bytes())  # the mark that editors of Windows put before it
     assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2"]) == 2
     assert "(-o DIR)" in capsys.readouterr().err
-    output = tmp_path / "half"
+    output = tmp_path / "c" / "half"
     assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2", "-o", str(output)]) == 0
     said = capsys.readouterr().out
     assert f"left out: 2 of 5 images: {world.names[1]}, {world.names[3]}" in said
@@ -275,6 +275,7 @@ def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     assert scene.views[0].image_rgb() is not None
     assert len(scene.points) == 50
     assert not (tmp_path / "c" / "masks").exists()
+    assert not (output / "half").exists(), "it holds no link to itself"
 
 
 def test_colmap_captures(tmp_path):
@@ -464,5 +465,8 @@ def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_p
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     assert ALONE.threads == 4
     assert MaskSettings(proposer=str(tmp_path)).threads == 4  # a folder of masks
+    (tmp_path / "opencv").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert ALONE.folder is None  # a clone of OpenCV is no folder of masks
     assert MaskSettings(proposer="sam:facebook/sam-vit-base").threads == 1
     assert MaskSettings(encoder="openai/clip-vit-base-patch16").threads == 1

@@ -59,6 +59,7 @@ def read_bundle(path: str | os.PathLike[str]) -> Bundle:
             members, carried = _members(file)
         manifest = _manifest(members)
         _check_members(manifest, members, carried)
+        # Only what is whole and declared is looked into, part by part, each held against what the others say.
         return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
@@ -233,6 +234,7 @@ def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np
     """(R, D) float32, a view into the constants of the graph: they are stored once."""
     graph = members["query.onnx"]
     offset, shape = _field(place, "offset", int, "descriptors/"), _field(place, "shape", list, "descriptors/")
+    # Both come from the file: no negative length and no offset may lead outside the graph's bytes.
     sizes_fit = len(shape) == 2 and all(isinstance(length, int) and length >= 0 for length in shape)
     if not sizes_fit or not 0 <= offset <= len(graph) - 4 * shape[0] * shape[1]:
         raise _Refused(f"descriptors of shape {shape} at byte {offset} lie outside query.onnx: {ogpc.REBUILD}")

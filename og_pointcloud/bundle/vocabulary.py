@@ -195,6 +195,7 @@ def _rewrite(
     changes: Mapping[str, bytes],
 ) -> None:
     """A bundle with some members replaced or added, and this manifest; the others are copied as they are."""
+    # The manifest names all members: of those that change, bytes and checksums; the others' stay true.
     members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}
     text = json.dumps({**manifest, "members": members}, indent=1, ensure_ascii=False).encode()
     with zipfile.ZipFile(path) as source, replacing(output or path) as file, zipfile.ZipFile(file, "w") as target:

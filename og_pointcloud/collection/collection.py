@@ -237,6 +237,7 @@ class Collection:
     ) -> list[tuple[float, Finding]]:
         """The best of a group for a word, with what they are ranked by."""
         block = self._blocks.get(group.name) or self._block(group, wanted, vector)
+        # A block holds a whole group or more than was asked for: its ranking leaves the rest out.
         asked = np.ones(len(block.entries), bool) if wanted.ids is None else np.isin(block.ids, list(wanted.ids))
         words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))  # unit vectors
         rivals = words[words @ vector < SAME_WORD]

@@ -68,6 +68,7 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, NDArray[np.void]]:
     with naming(path), path.open("rb") as file:
         header = _parse_header(file.read(HEADER_LIMIT))
         file.seek(header.data_offset)
+        # Where a row of lists ends is known only once it is read: elements behind one have no place to seek to.
         plain = takewhile(lambda element: not element.has_lists, header.elements)
         return {element.name: _rows(file, element, header.byte_order) for element in plain}
 

@@ -203,7 +203,7 @@ def numbered(files: Iterable[Path]) -> list[Path]:
 def numbered_images(folder: Path) -> list[Path]:
     """The images in a folder, as `numbered`; none where it is no folder."""
     found = folder.iterdir() if folder.is_dir() else ()
-    return numbered(file for file in found if file.suffix in IMAGE_SUFFIXES and file.is_file())
+    return numbered(file for file in found if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file())
 
 
 def the_only(folder: Path, pattern: str, what: str) -> Path | None:

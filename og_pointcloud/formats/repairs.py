@@ -156,6 +156,7 @@ def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
     """The masks as their files mean them; layers: in the order of the pose file."""
     repaired = list(layers)
+    # In the order in which they are listed: a shift of images and a flip of each do not depend on each other.
     for value in (repair.value for repair in repairs if repair.name == "masks"):
         if value in MASK_SHIFTS:
             by = MASK_SHIFTS[value] % len(repaired)

@@ -152,6 +152,7 @@ def _replica(folder: Path) -> Iterator[RecordedFrame]:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
+    # Images and poses go by their place alone: were there fewer poses, it is not known which image lacks its own.
     if not images or len(images) > len(poses):
         raise SceneError(
             f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "

@@ -89,6 +89,7 @@ class Scale:
     def likeness(self, one: Look, later: Look) -> float:
         """How likely the two are one thing: about 1 for one, 0 for two different ones, -inf where size or colour rule
         it out."""
+        # What rules a match out comes first; only then do descriptors count.
         longer, shorter = max(one.length, later.length), min(one.length, later.length)
         if longer > OTHER_SIZE * shorter or not one.has_color_of(later, self.color, self.shift):
             return -np.inf

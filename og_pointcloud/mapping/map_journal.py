@@ -124,6 +124,7 @@ def _next_record(file: io.BufferedReader) -> bytes | None:
     if len(head) < HEAD.size:
         return None
     magic, length, checksum = HEAD.unpack(head)
+    # A torn length may say anything: no room is made for more than the file holds.
     if magic != MAGIC or length > os.fstat(file.fileno()).st_size:
         return None
     record = file.read(length)

@@ -60,6 +60,7 @@ class MapRecord:
             raise OgPointcloudError(
                 f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
             ) from None
+        # Ids are rows of the table: one beyond it would be found only where somebody asks for it.
         ids = {*record.last_seen, *record.moved_from, *record.gone}
         if ids and not 0 <= min(ids) <= max(ids) < count:
             raise OgPointcloudError(f"the map's record names instance {max(ids)} of {count}: fit it again")
@@ -67,6 +68,7 @@ class MapRecord:
 
     def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:
         """The provenance with this record, JSON-able."""
+        # Of how a thing looked, all but its descriptors, which the table has.
         gone = {
             k: {"place": look.place.tolist(), "length": look.length,
                 "color": None if look.color is None else look.color.tolist()}

@@ -128,8 +128,15 @@ class MaskSettings:
             )
 
     @property
+    def folder(self) -> Path | None:
+        """The folder of masks that stands in place of a proposer's name; None for a proposer."""
+        folder = Path(self.proposer)
+        # Whoever has a clone of OpenCV beside the capture does not mean it.
+        return folder if self.proposer != "opencv" and folder.is_dir() else None
+
+    @property
     def threads(self) -> int:
         """Images worked on side by side: one a core, but only one with models, which fill memory and cores
         themselves."""
-        light = (self.proposer == "opencv" or Path(self.proposer).is_dir()) and self.encoder in (None, "demo")
+        light = (self.proposer == "opencv" or self.folder) and self.encoder in (None, "demo")
         return (os.cpu_count() or 1) if light else 1

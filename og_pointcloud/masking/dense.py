@@ -39,12 +39,15 @@ class DenseEncoder(MaskEncoder):
         found = self.model.patches(self._pixels(image))
         height, width = found.shape[:2]
         shares = [_shares(mask, width, height) for mask in masks]
+        # Weighted sums in place of means: the length goes at the end anyway.
         total = np.stack(shares).reshape(len(masks), -1) @ found.reshape(-1, self.width)
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def _pixels(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(1, 3, h, w) float32, a whole number of patches along each side; the image's shape but for rounding."""
         before, pillow = self.model.preprocessing, require_pillow()
+        # Both sides by one scale, then each to its nearest whole patch: models were trained on squares, but a squeezed
+        # image would show squeezed things.
         scale = SHORTER_SIDE * before.size / min(image.shape[:2])
         height, width = (max(1, round(side * scale / self.patch)) * self.patch for side in image.shape[:2])
         resized = pillow.fromarray(image).resize((width, height), pillow.Resampling[before.resample.upper()])

@@ -121,8 +121,7 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
 def _fingerprint(settings: MaskSettings) -> str:
     """A name for settings, and for the masks of a folder that they name: work files of others are not taken up."""
     of_image = replace(settings, every=1)  # which images are used does not change what one of them gives
-    given = Path(settings.proposer)
-    masks = [_state(file) for file in sorted(given.rglob("*"))] if given.is_dir() else []
+    masks = [_state(file) for file in sorted(settings.folder.rglob("*"))] if settings.folder else []
     return _digest([VERSION, asdict(of_image), masks])
 
 
@@ -235,8 +234,9 @@ def _last_part(value: Any) -> Any:
 def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) -> None:
     """Poses of the chosen images, and links to all else that the capture has and the target lacks."""
     kept = {photograph.path for photograph in chosen}
+    others = {MASKS_FOLDER, FEATURES_NAME, LANGUAGE_FEATURES_FOLDER, WORK_FOLDER}
     for source in sorted(capture.resolve().iterdir()):
-        if source.name in (MASKS_FOLDER, FEATURES_NAME, LANGUAGE_FEATURES_FOLDER, WORK_FOLDER):
+        if source.name in others or source == target.resolve():  # which may lie in the capture
             continue
         place = target / source.name
         if source.name in TRANSFORMS_NAMES:

@@ -66,6 +66,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
 
 def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
     whole = image.camera if image.face is None else image.face.whole
+    # Here, and not when the image's turn comes: a night of work must not end in a wrong size.
     cure = (
         "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
         "pixels as stored)"

@@ -110,6 +110,7 @@ class SamPredictor:
         preparation, device = self.loaded.preparation, self.loaded.device
         height, width = scaled_size(self.size, preparation)
         scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
+        # Prompts count the pixels of the model's square, in which the image was scaled.
         asked = torch.from_numpy(points * scale)[None, :, None].to(device)  # (images, prompts, points each, xy)
         labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=device)  # 1: on the thing
         answer = self.loaded.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)

@@ -37,9 +37,8 @@ class ImageWorker:
     def __init__(self, settings: MaskSettings, done: int = 0) -> None:
         """done: images that earlier runs have done; tracks do not go on from these."""
         self.settings = settings
-        folder = Path(settings.proposer)
-        if folder.is_dir() and not settings.words:
-            self.proposer = ExistingMasks(folder, settings.tracks)
+        if settings.folder and not settings.words:
+            self.proposer = ExistingMasks(settings.folder, settings.tracks)
         else:
             self.proposer = open_proposer(settings.proposer, settings.words, done if settings.tracks else None)
         self.encoder = open_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
