@@ -131,9 +131,8 @@ def judged(folder: Path, repairs: tuple[str, ...] | list[str], fitted: bool) -> 
 
 def with_words(cloud: LabelledCloud, folder: Path) -> LabelledCloud:
     """The cloud with the words and the word bank of its folder."""
-    bank = folder / "word_bank.npz"
     space = FeatureSpace(cloud.feature_space, cloud.space.width)
-    return scene_words(space, word_bank=bank if bank.is_file() else None, capture=folder).added_to(cloud)
+    return scene_words(space, capture=folder).added_to(cloud)
 
 
 def false_alarms(captures: list[Path], fitted: bool) -> None:

@@ -52,6 +52,7 @@ class LeftOut(Enum):
         "whole fit", "a fit of all points at once", "{count:,} points take more memory than it has: fitted in tiles",
     )
     VOCABULARY = "vocabulary", "vocabulary", "{reason}"
+    WORD_BANK = "word bank", "word bank", "{reason}"
     EMPTY_LEAVES = "empty leaves", "{count} of {total} leaves", "no visible Gaussian is in them"
     FAINT_GAUSSIANS = "faint gaussians", "{count} Gaussians", "less opaque than {opacity}: they cannot be seen"
     # fmt: on

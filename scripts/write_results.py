@@ -81,10 +81,9 @@ def _numbers(text: str) -> list[int]:
 def measure(folder: Path, runs: int = 1) -> Result:
     """Fit a capture with the command, ask the file, score it; and the baselines on the same masks."""
     truth, words, scene = read_truth(folder), folder / WORDS, read_capture(folder)
-    bank = ["--word-bank", str(folder / BANK)] if (folder / BANK).is_file() else []
     with tempfile.TemporaryDirectory() as temporary:
         bundle = Path(temporary) / "scene.ogpc"
-        seconds = min(timed(["fit", str(folder), "-o", str(bundle), *bank]) for _ in range(runs))
+        seconds = min(timed(["fit", str(folder), "-o", str(bundle)]) for _ in range(runs))
         answer = ask(og.load(bundle), truth, words)
     vocabulary, prepared = read_text_features(words)[0], prepare(scene)
     baselines = {

@@ -252,7 +252,7 @@ def test_an_encoder_brings_its_bank(path, encoder_folder, tmp_path, monkeypatch,
 
 
 @pytest.mark.slow
-def test_fit_stores_the_bank_asked_for_else_the_encoders(encoder_folder, tmp_path, monkeypatch, capsys):
+def test_fit_stores_the_bank_asked_for_else_its_own_else_the_encoders(encoder_folder, tmp_path, monkeypatch, capsys):
     folder, path = write_tiny_capture(tmp_path / "capture").folder, tmp_path / "s.ogpc"
     names = np.array([f"word {number}" for number in range(60)])
     for name, count, width, space in (("f", 60, WIDTH, SPACE), ("few", 49, WIDTH, SPACE), ("wide", 60, 20, SPACE),
@@ -274,6 +274,14 @@ def test_fit_stores_the_bank_asked_for_else_the_encoders(encoder_folder, tmp_pat
         assert fit(*arguments) == 0
         assert "vocabulary bank" not in capsys.readouterr().out
         assert len(read_bundle(path).cloud.word_bank.vectors) == count
+    # The capture's own comes before the encoder's, if it is of the masks' space.
+    for bank, left_out, count in (("f", [], 60), ("other", ["word bank"], len(everyday_words()))):
+        (folder / "word_bank.npz").write_bytes((tmp_path / f"{bank}.npz").read_bytes())
+        assert fit() == 0
+        cloud = read_bundle(path).cloud
+        assert len(cloud.word_bank.vectors) == count
+        assert [entry["key"] for entry in cloud.provenance["left_out"] if entry["key"] == "word bank"] == left_out
+    (folder / "word_bank.npz").unlink()
     for file in encoder_folder.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / "tokenizer.json").write_bytes(b"torn")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -27,8 +27,8 @@ from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, find_encoder, read_text_encoder
 from og_pointcloud.text.text_features import read_text_features
 
-CAPTURE_WORDS = "text_features.npz"
-"""Name of the text features that a capture folder may hold."""
+CAPTURE_WORDS = {"text_features.npz": LeftOut.VOCABULARY, "word_bank.npz": LeftOut.WORD_BANK}
+"""Files of words that a capture folder may hold, and what a fit says where they are of another feature space."""
 
 
 @dataclass(frozen=True)
@@ -56,27 +56,33 @@ def scene_words(
 ) -> SceneWords:
     """The words for a scene whose masks are of this feature space; cheap enough to be checked before a fit.
 
-    text_features: an .npz with the vocabulary; None: the capture folder's own where it has one of this space.
-    word_bank: an .npz of at least 50 everyday words; None: that of the text encoder found for the space, if any.
+    text_features: an .npz with the vocabulary; None: the capture folder's text_features.npz, if that is of this space.
+    word_bank: an .npz of at least 50 everyday words; None: the capture folder's word_bank.npz, if that is of this
+        space, else that of the text encoder found for the space, if any.
     FeatureSpaceError where a file cannot be read, or one that was asked for is of another space or width.
     """
-    vocabulary, left_out = None, ()
-    # A file that was named must fit; one that merely lies in the capture's folder is left out, and provenance says so.
-    if text_features is not None:
-        vocabulary, name = read_text_features(text_features)
-        space.require(FeatureSpace(name, vocabulary.vectors.shape[1]), f"names of {text_features}")
-    elif capture is not None and (own := Path(capture) / CAPTURE_WORDS).is_file():
-        vocabulary, name = read_text_features(own)
-        of_words = FeatureSpace(name, vocabulary.vectors.shape[1])
-        if name != space.name or not space.accepts(of_words):
-            reason = f"{own.name} is of {of_words}, the masks are of {space}: encode the names with the masks' model"
-            vocabulary, left_out = None, (left_out_entry(LeftOut.VOCABULARY, reason=reason),)
-    if word_bank is not None:
-        bank, name = read_bank(word_bank)
-        space.require(FeatureSpace(name, bank.vectors.shape[1]), f"words of {word_bank}")
-    elif bank := bank_of_encoder(space):
+    left_out = []
+
+    def words_of(asked: str | os.PathLike[str] | None, own: str, read: Callable[[Path], tuple[Any, str]]) -> Any:
+        """Of a file that was asked for, which must fit; else of the capture's own, which is left out if it does not."""
+        if asked is None and (capture is None or not (Path(capture) / own).is_file()):
+            return None
+        file = Path(capture or "", own) if asked is None else Path(asked)
+        words, name = read(file)
+        of_words = FeatureSpace(name, words.vectors.shape[1])
+        if asked is not None:
+            space.require(of_words, f"words of {file}")
+        elif name != space.name or not space.accepts(of_words):
+            reason = f"{own} is of {of_words}, the masks are of {space}: encode the words with the masks' model"
+            left_out.append(left_out_entry(CAPTURE_WORDS[own], reason=reason))
+            return None
+        return words
+
+    vocabulary = words_of(text_features, "text_features.npz", read_text_features)
+    bank = words_of(word_bank, "word_bank.npz", read_bank)
+    if bank is None and (bank := bank_of_encoder(space)):
         space.require(FeatureSpace(space.name, bank.vectors.shape[1]), "word bank of the text encoder found for it")
-    return SceneWords(vocabulary, bank, left_out)
+    return SceneWords(vocabulary, bank, tuple(left_out))
 
 
 def bank_of_encoder(space: FeatureSpace, folder: str | os.PathLike[str] | None = None) -> WordBank | None:

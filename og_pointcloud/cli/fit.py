@@ -44,7 +44,8 @@ def add(parser: Parser) -> None:
     option("--schedule-share", "X", "shorten the published schedule (mode paper; default: 1)", type=float)
     option("--mask-level", None, "of LangSplat masks (default: %(default)s)", choices=MASK_LEVELS, default="large")
     option("--vocabulary", "F.npz", "words that can be asked (default: the capture's text_features.npz)", type=Path)
-    option("--word-bank", "F.npz", "50 everyday words or more to judge labels by (default: the encoder's)", type=Path)
+    bank = "50 everyday words or more to judge labels by (default: the capture's word_bank.npz, else the encoder's)"
+    option("--word-bank", "F.npz", bank, type=Path)
     option("--seed", "N", "of everything random (default: %(default)s)", type=int, default=0)
     option("--memory", "4GB", "a larger table of masks goes to disk (default: half of what is free)")
     option("--tile-points", "N", "fit in tiles of so many points (default: where one fit would not fit)", type=int)
