@@ -88,7 +88,7 @@ class Camera:
             raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
         pose = pose.astype(np.float64, copy=False)
         object.__setattr__(self, "world_to_camera", pose)
-        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        numbers = (self.width, self.height, *self.intrinsics)
         if not all(isinstance(number, Real) for number in numbers):
             raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers of pixels")
         error, determinant = rotation_error(pose[:3, :3])
@@ -102,10 +102,9 @@ class Camera:
                 f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
                 f"most {LONGEST_SIDE} a side: check w and h of the pose file"
             )
-        intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
+        if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
             raise SceneError(
-                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0 "
+                f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, fx and fy > 0 "
                 f"by {SHORTEST_FOCAL:g} of the image's sides or more: check the camera model in the pose file"
             )
 
@@ -134,6 +133,11 @@ class Camera:
         """(n,) bool: which of `project`'s pixel coordinates (n, 2) fall into the image; NaN does not."""
         u, v = uv_px.T
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy."""
+        return self.fx, self.fy, self.cx, self.cy
 
     @property
     def center(self) -> DoubleArray:

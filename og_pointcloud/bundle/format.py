@@ -52,7 +52,7 @@ CARRIED_ENCODER = "text_encoder/"
 
 def rows_of_cameras(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """(V, 18) float64 a camera: width, height, fx, fy, cx, cy, and the first three rows of world_to_camera."""
-    rows = [(c.width, c.height, c.fx, c.fy, c.cx, c.cy, *c.world_to_camera[:3].ravel()) for c in cameras]
+    rows = [(c.width, c.height, *c.intrinsics, *c.world_to_camera[:3].ravel()) for c in cameras]
     return np.array(rows, np.float64).reshape(-1, 18)
 
 

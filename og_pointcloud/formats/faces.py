@@ -128,7 +128,7 @@ def _scaled(camera: Camera, x: float, y: float) -> tuple[int, int]:
 
 
 def _numbers(camera: Camera) -> Numbers:
-    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+    return camera.width, camera.height, *camera.intrinsics
 
 
 @lru_cache(maxsize=64)

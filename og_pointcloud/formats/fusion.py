@@ -268,7 +268,7 @@ def _judge(
         surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
         # A view looks through a point only if all pixels around do: a thin thing half a pixel off is still there.
         nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
-        seen_from = camera.world_to_camera[:3, :3], camera.center - origin, (camera.fx, camera.fy, camera.cx, camera.cy)
+        seen_from = camera.world_to_camera[:3, :3], camera.center - origin, camera.intrinsics
         depths, limits = (image.depth, surface, nearest), (found.tolerance, found.depth)
         _add_votes(xyz, seen_from, depths, limits, votes, shift)
     confirmed, refuted, could_see = votes.T

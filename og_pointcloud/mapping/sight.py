@@ -27,7 +27,7 @@ from og_pointcloud.formats.capture import depth_files, read_poses
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.mapping.voxels import in_camera, lens_of, turned
+from og_pointcloud.mapping.voxels import in_camera, turned
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
@@ -79,7 +79,7 @@ class MeasuredView:
         """What `_state_of` reads of a view. tolerance: without the view's own noise, which is added here."""
         if tolerance not in self._asked:
             # The point's error and that of the surface, three standard deviations of it, are independent.
-            within, lens = float(np.hypot(tolerance, 3 * self.noise)), lens_of(self.camera)
+            within, lens = float(np.hypot(tolerance, 3 * self.noise)), np.array(self.camera.intrinsics)
             planes, own = _planes_of(self.depth, self.normal, lens, within)
             # A maximum over the 3 x 3 pixels: behind it, none of the surfaces that a point is held against holds it.
             beyond = require_cv2().dilate(own, np.ones((3, 3), np.uint8))
@@ -118,7 +118,9 @@ class DiscSurface:
         size = max(8, round(camera.width * share)), max(8, round(camera.height * share))
         camera = camera.resized(*size) if share < 1 else camera
         discs, size = (self.xyz, self.normal, self._radius), (camera.height, camera.width)
-        depth, normal = _draw_discs(discs, camera.world_to_camera, lens_of(camera), size, NEAR_SHARE * typical)
+        depth, normal = _draw_discs(
+            discs, camera.world_to_camera, np.array(camera.intrinsics), size, NEAR_SHARE * typical
+        )
         return MeasuredView(camera, depth, normal, self.noise)
 
 
@@ -138,7 +140,7 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
         lens = camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step
         camera = Camera(width, height, *lens, camera.world_to_camera)
         depth = np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)
-    normal, second = _normals(depth, lens_of(camera))
+    normal, second = _normals(depth, np.array(camera.intrinsics))
     second = second[np.isfinite(second)]
     # before - 2 here + after of readings with independent noise s has the variance (1 + 4 + 1) s^2; the median of its
     # size times 1.4826 is its standard deviation, whatever edges of objects add to a few of them. This is the noise

@@ -95,7 +95,7 @@ class Packets:
         """Rows of packets that may have points in an image, or within a share ``margin`` beyond its border: the sphere
         around the packet's box meets the frustum. edge: of a voxel; no point has moved by two since it was filed, as it
         stays in its voxel."""
-        fx, fy, cx, cy = lens_of(camera)
+        fx, fy, cx, cy = camera.intrinsics
         across, down = margin * camera.width, margin * camera.height
         # The frustum is where all five products are positive: u > 0, for one, is fx x + cx z > 0. Its planes go through
         # the camera, so that each is a normal alone, in the camera's frame, pointing inwards; the first is z = 0.
@@ -185,11 +185,6 @@ class VoxelPoints(Columns):
         """Room for so many more points."""
         self.grow(self.n + more)
         self.hash.reserve(self.n + more)
-
-
-def lens_of(camera: Camera) -> NDArray[np.float64]:
-    """(4,) fx, fy, cx, cy."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 @njit(cache=True, nogil=True)

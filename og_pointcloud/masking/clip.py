@@ -100,7 +100,6 @@ class TransformersModel:
 
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
     """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
-    size, is_clip = config.vision_config.image_size, config.model_type == "clip"
     stated = read_config(Path(folder), "preprocessor_config.json")
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
@@ -109,9 +108,9 @@ def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessi
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
     # What the folder does not state is as in the published models of its family.
-    mean, std = CLIP_COLORS if is_clip else SIGLIP_COLORS
+    mean, std = CLIP_COLORS if config.model_type == "clip" else SIGLIP_COLORS
     mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
-    return Preprocessing(size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number], keeps_shape=is_clip)
+    return Preprocessing(config.vision_config.image_size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number])
 
 
 def published_name(folder: str | os.PathLike[str]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,21 +49,18 @@ CROP_STYLES = {"langsplat": LANGSPLAT, "context": WITH_CONTEXT}
 class Preprocessing:
     """How squares of an image become what an image model takes.
 
-    size: of the square, pixels. mean, std: RGB, of values in [0, 1]. keeps_shape: whether the model's own processor
-    cuts an image to a square rather than squeezing it; crops of masks are squares already.
+    size: of the square, pixels. mean, std: RGB, of values in [0, 1].
     """
 
     size: int
     mean: Color
     std: Color
     resample: Resample = "bicubic"
-    keeps_shape: bool = True
 
     def __post_init__(self) -> None:
-        numbers = np.array([*self.mean, *self.std], float)
-        if not 1 <= self.size <= MAX_SIZE or len(self.mean) != 3 or len(self.std) != 3 or self.resample not in (
-            "bilinear", "bicubic"
-        ) or not np.isfinite(numbers).all() or min(self.std) <= 0:  # fmt: skip
+        are_colors = len(self.mean) == len(self.std) == 3 and np.isfinite([*self.mean, *self.std]).all()
+        known = self.resample in get_args(Resample) and 1 <= self.size <= MAX_SIZE
+        if not (known and are_colors and min(self.std) > 0):
             raise OgPointcloudError(
                 f"preprocessing is {self}; expected a size up to {MAX_SIZE}, three finite means, three deviations "
                 "above 0, and bilinear or bicubic"
@@ -72,7 +69,8 @@ class Preprocessing:
     @classmethod
     def from_manifest(cls, entry: Mapping[str, Any]) -> Preprocessing:
         """From the fields as JSON has them; TypeError for others."""
-        return cls(**{**entry, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
+        known = {name: value for name, value in entry.items() if name != "keeps_shape"}  # of earlier exports, unused
+        return cls(**{**known, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
 
     @property
     def fill(self) -> tuple[int, int, int]:

@@ -1,8 +1,7 @@
 """Masks without a model: superpixels merged by color and contrast into a region tree.
 
-1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that no
-superpixel
-   runs from one surface into another of its color.
+1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
+   from one surface into another of its color.
 2. Merging: in every round, pairs of neighbors that are each other's nearest become one region. The distance of two
    regions follows from their mean colors and the contrast along their common border; small regions are nearer to all
    their neighbors, and so are textured ones.

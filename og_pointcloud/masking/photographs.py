@@ -13,7 +13,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.faces import Face
-from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, require_scaled, write_png
+from og_pointcloud.formats.images import image_size, require_cv2, require_scaled, write_png
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
@@ -45,8 +45,6 @@ class Photograph:
             width, height = camera.width, camera.height
         scale = min(1.0, longest_side / max(width, height))
         size = (width, height) if scale == 1 else (max(1, round(width * scale)), max(1, round(height * scale)))
-        if self.face is None:
-            return read_rgb(self.file, size)
         return read_photograph(self.file, self.camera.resized(*size), self.face)
 
 

@@ -63,10 +63,9 @@ Pair = tuple[NDArray[np.float32], NDArray[np.float32], float]
 
 @dataclass(frozen=True)
 class Terms:
-    """separation: mean over views of Eq. 2. cohesion: Eq. 1 over all masked pixels. objective: their weighted sum,
+    """cohesion: Eq. 1 over all masked pixels. objective: the weighted sum of Eq. 2, as a mean over views, and of Eq. 1,
     without the terms that are off. gradient: of the objective, (n, width) in the features' dtype."""
 
-    separation: float
     cohesion: float
     objective: float
     gradient: NDArray[np.floating]
@@ -188,7 +187,7 @@ class FeatureObjective:
         pull = (pull + factor * (-2 / total * self._size[:, None] * means)) / self._size[:, None]
         gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * (2 / total * blended)
         objective = settings.inter * separation + factor * cohesion
-        return Terms(separation, cohesion, objective, gradient.astype(features.dtype))
+        return Terms(cohesion, objective, gradient.astype(features.dtype))
 
 
 def _minimise(
