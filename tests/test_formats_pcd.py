@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labelled_clouds import make_cloud
 
+import og_pointcloud as og
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.pcd import read_pcd
 from og_pointcloud.formats.points import read_points
@@ -135,7 +137,7 @@ def test_packed_colours_keep_their_bits_whatever_type_the_file_gives_them(tmp_pa
     assert points.xyz_world.tolist() == [[1e6, 2, 3]]
 
 
-def test_an_organised_cloud_with_invalid_points_is_one_clear_error(tmp_path):
+def test_invalid_points_of_an_organised_cloud_are_left_out_of_fits_and_answered_unknown_in_their_rows(tmp_path):
     header = "VERSION 0.7\r\nFIELDS x y z\r\nSIZE 4 4 4\r\nTYPE F F F\r\nWIDTH 3\r\nHEIGHT 2\r\nDATA binary\r\n"
     xyz = np.arange(18, dtype="<f4").reshape(6, 3)
     path = tmp_path / "a.pcd"
@@ -143,7 +145,16 @@ def test_an_organised_cloud_with_invalid_points_is_one_clear_error(tmp_path):
     np.testing.assert_array_equal(read_points(path).xyz_world, xyz)
     xyz[[2, 4]] = np.nan
     path.write_bytes(header.encode() + xyz.tobytes())
-    with pytest.raises(SceneError, match=r"a\.pcd: 2 of 6 points hold NaN or infinity .the first is row 2"):
+    says = r"a\.pcd: 2 of 6 points hold NaN or infinity \(the first is row 2\): "
+    with pytest.warns(UserWarning, match=f"{says}left out"):
+        np.testing.assert_array_equal(read_points(path).xyz_world, xyz[[0, 1, 3, 5]])
+    scene = make_cloud(xyz[[0, 1, 3, 5]], [0, 0, 1, 1])
+    with pytest.warns(UserWarning, match=f"{says}unknown"):
+        answer = og.segment(path, ["apple"], scene)
+    np.testing.assert_array_equal(answer.instances, og.segment(xyz, ["apple"], scene).instances)
+    assert answer.instances.tolist() == [0, 0, -3, 1, -3, 1]
+    path.write_bytes(header.encode() + np.full_like(xyz, np.nan).tobytes())
+    with pytest.raises(SceneError, match="0 points, and 6 that hold NaN or infinity; expected at least one"):
         read_points(path)
 
 

@@ -33,9 +33,9 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     MissingExtraError where reading needs a library that is not installed.
     """
     if isinstance(pcd, (str, os.PathLike)):
-        from og_pointcloud.formats.points import read_points
+        from og_pointcloud.formats.points import read_places
 
-        return read_points(Path(pcd)).xyz_world
+        return read_places(pcd)
     kind = type(pcd).__name__
     if kind.endswith("PointCloud2"):  # rclpy's type, and rosbags' sensor_msgs__msg__PointCloud2
         return _checked(import_plugin("og_pointcloud_ros", "ros").from_pointcloud2(pcd), kind)

@@ -30,14 +30,15 @@ def run(arguments: argparse.Namespace) -> None:
     journal = Journal(progress=False)
     with journal.stage("load"):
         scene = og.load(arguments.bundle)
-        points = og.read_points(arguments.points) if arguments.points else None
     with journal.stage("segment"):
-        asked, labels = scene if points is None else points.xyz_world, common.names_in(arguments.labels)
-        result = og.segment(asked, labels, scene, text_features=arguments.text_features)
+        labels = common.names_in(arguments.labels)
+        result = og.segment(arguments.points or scene, labels, scene, text_features=arguments.text_features)
     if arguments.output:
         with journal.stage("save"):
             # Formats of splats are written as splats, where the points asked about are some.
-            splats = points if points is not None and points.scale is not None else None
+            as_splats = arguments.points and arguments.output.suffix in (".glb", ".spz")
+            points = og.read_points(arguments.points) if as_splats else None
+            splats = points if points is not None and points.are_gaussians else None
             result.save(arguments.output, splats, arguments.points)
     report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
     common.print_result(arguments, report, print_segmentation)

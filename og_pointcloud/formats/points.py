@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -26,9 +27,10 @@ def read_points(path: str | os.PathLike[str]) -> Points:
     """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.
 
     World coordinates are read as float64; their median becomes the origin. Colors come as uint8 RGB, None where the
-    file has none.
-    SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
-    extra 'las', E57 'e57', the newest SPZ 'spz'.
+    file has none. Points of a plain cloud that hold NaN or infinity, as depth cameras write them, are left out with a
+    warning.
+    SceneError, beginning with the path, for what cannot be read or has no points, and for Gaussians that hold NaN. LAS
+    and LAZ need the extra 'las', E57 'e57', the newest SPZ 'spz'.
 
     >>> import pathlib, tempfile
     >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
@@ -37,32 +39,66 @@ def read_points(path: str | os.PathLike[str]) -> Points:
     """
     path = Path(path)
     with naming(path):
-        with path.open("rb") as file:
-            head = file.read(4096)  # PCD headers may begin with comments
-        if head.startswith((b"ply\n", b"ply\r", b"ply ")):
-            elements = read_ply(path)
-            if holds_gaussians(elements):
-                return gaussians_from_ply(elements)
-            if "vertex" not in elements:
-                raise SceneError(
-                    "no element 'vertex' before the first with lists (faces); the file has "
-                    f"{', '.join(elements) or 'none':.200}: write the vertices first"
-                )
-            return _cloud(elements["vertex"])
-        if looks_like_pcd(head):
-            return _cloud(read_pcd(path))
-        if head.startswith(LAS_SIGNATURE):
-            return read_las(path)
-        if head.startswith(E57_SIGNATURE):
-            return read_e57(path)
-        if looks_like_spz(head):
-            return read_spz(path)
-        start = f"it starts with {head[:16]!r}" if head else "it is empty"
-        raise SceneError(
-            f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-            "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, an E57 or an SPZ: convert it"
-            " first"
-        )
+        found = _read(path)
+        if isinstance(found, Points):
+            return found
+        placed = _placed(path, positions(found), "left out")
+        return Points.from_world(positions(found)[placed], rgb=colors(found[placed]))
+
+
+def read_places(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """(n, 3) float64 world coordinates of every row of such a file, to be labelled: rows with NaN or infinity stay, and
+    a warning says that they stay unknown."""
+    path = Path(path)
+    with naming(path):
+        found = _read(path)
+        if isinstance(found, Points):
+            return found.xyz_world
+        _placed(path, positions(found), "unknown")
+        return positions(found)
+
+
+def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_]:
+    """(n,) bool, points whose coordinates are finite; a warning where some are not, SceneError where none is."""
+    placed = np.logical_and.reduce(np.isfinite(xyz), axis=1)
+    if not placed.any():
+        rest = f", and {len(xyz)} that hold NaN or infinity" if len(xyz) else ""
+        raise SceneError(f"the cloud has 0 points{rest}; expected at least one: check the geometry file")
+    if missing := int((~placed).sum()):
+        first = int(np.argmin(placed))
+        what = f"{missing} of {len(xyz)} points hold NaN or infinity (the first is row {first}): {then}"
+        warnings.warn(f"{path}: {what}", stacklevel=3)
+    return placed
+
+
+def _read(path: Path) -> Points | NDArray[np.void]:
+    """A file's points; of a plain cloud in PLY or PCD its rows as they are."""
+    with path.open("rb") as file:
+        head = file.read(4096)  # PCD headers may begin with comments
+    if head.startswith((b"ply\n", b"ply\r", b"ply ")):
+        elements = read_ply(path)
+        if holds_gaussians(elements):
+            return gaussians_from_ply(elements)
+        if "vertex" not in elements:
+            raise SceneError(
+                "no element 'vertex' before the first with lists (faces); the file has "
+                f"{', '.join(elements) or 'none':.200}: write the vertices first"
+            )
+        return elements["vertex"]
+    if looks_like_pcd(head):
+        return read_pcd(path)
+    if head.startswith(LAS_SIGNATURE):
+        return read_las(path)
+    if head.startswith(E57_SIGNATURE):
+        return read_e57(path)
+    if looks_like_spz(head):
+        return read_spz(path)
+    start = f"it starts with {head[:16]!r}" if head else "it is empty"
+    raise SceneError(
+        f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
+        "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, an E57 or an SPZ: convert it"
+        " first"
+    )
 
 
 def write_labelled_ply(
@@ -81,7 +117,3 @@ def write_labelled_ply(
     comment = f"og_names {json.dumps(list(names))}"
     fits = names and len(comment) < HEADER_LIMIT // 2
     write_ply(path, {"vertex": plain_rows(xyz_world, np.asarray(rgb, np.uint8), attributes)}, [comment] if fits else [])
-
-
-def _cloud(rows: NDArray[np.void]) -> Points:
-    return Points.from_world(positions(rows), rgb=colors(rows))
