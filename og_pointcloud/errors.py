@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 def printable(text: str, most: int | None = None) -> str:
@@ -27,6 +32,12 @@ def coordinate(value: float) -> str:
     ('0.5231', '4000123.4')
     """
     return f"{value:.1f}" if 1e3 <= abs(value) < 1e15 else f"{value:.4g}"
+
+
+def span(points: NDArray[np.floating]) -> str:
+    """The box of points (n, 3) to be read, from..to along x, y and z."""
+    bounds = zip(points.min(axis=0), points.max(axis=0), strict=True)
+    return " x ".join(f"{coordinate(low)}..{coordinate(high)}" for low, high in bounds)
 
 
 def first_line(error: BaseException) -> str:

@@ -89,6 +89,7 @@ def test_points_get_probabilities_and_reasons(scene, made):
     result = og.segment(points, names, scene)
     labels, scores, reasons = zip(*answers_plainly(scene, points, made.texts[asked]), strict=True)
     assert result.calibrated
+    assert "fitting or not" not in repr(result)
     assert result.labels.tolist() == list(labels)
     assert result.reasons.dtype == np.int8
     assert result.reasons.tolist() == list(reasons)

@@ -324,8 +324,13 @@ def test_no_mask_at_all_is_an_error(known: Known) -> None:
 
 
 def test_cameras_that_see_nothing_are_an_error(known: Known) -> None:
-    with pytest.raises(SceneError, match="no camera sees the cloud"):
-        prepare(replace(known.scene, views=tuple(turned_away(view) for view in known.scene.views)))
+    views = tuple(turned_away(view) for view in known.scene.views)
+    onto_a_map = replace(known.scene.points, origin=known.scene.points.origin + np.array([431000, 5412000, 0]))
+    with pytest.raises(SceneError, match=r"no camera sees the cloud.*; the cloud spans 43\d{4}\.\d\.\.43") as caught:
+        prepare(replace(known.scene, views=views, points=onto_a_map))
+    # Also the cameras where the world has them, so that one sees whether an offset is missing.
+    lowest = min(view.camera.center[1] for view in views) + onto_a_map.origin[1]
+    assert f" x {lowest:.1f}.." in str(caught.value).partition("cameras stand at")[2]
 
 
 def turned_away(view: View) -> View:

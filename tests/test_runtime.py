@@ -376,7 +376,7 @@ def test_what_is_printed_fits_on_a_screen(scene):
     points = np.concatenate([scene.xyz, [[99, 99, 99]]])
     result = quietly(points, ["apple", "pear"], scene)
     lines = repr(result).splitlines()
-    assert lines[0] == f"{len(points):,} points"
+    assert lines[0] == f"{len(points):,} points, each with its best label, fitting or not (no word bank)"
     assert lines[-1].split("  ")[0] == "unknown, too far from the scene"
     counted = [int(line.rsplit(maxsplit=1)[1].replace(",", "")) for line in lines[1:]]
     assert sum(counted) == len(points)

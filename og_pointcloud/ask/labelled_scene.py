@@ -27,7 +27,7 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, SceneError, coordinate
+from og_pointcloud.errors import OgPointcloudError, SceneError, span
 from og_pointcloud.scene import RIGID, float32_step, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
@@ -431,7 +431,7 @@ def _misplaced(points: NDArray[np.float64], far: int, scene: LabelledScene) -> s
         )
     if far > ELSEWHERE_SHARE * len(points):
         return (
-            f"the points span {_box(points)}, the scene {_box(scene.xyz)}, its reach is {reach:.4g}: bring them into "
+            f"the points span {span(points)}, the scene {span(scene.xyz)}, its reach is {reach:.4g}: bring them into "
             "the scene's frame and unit"
         )
     if many and (width := _width(some)) < reach < _width(scene.cloud.xyz) / WIDE:
@@ -444,8 +444,3 @@ def _misplaced(points: NDArray[np.float64], far: int, scene: LabelledScene) -> s
 
 def _width(points: NDArray[np.floating]) -> float:
     return float(np.ptp(points, axis=0).max())
-
-
-def _box(points: NDArray[np.float64]) -> str:
-    low, high = points.min(axis=0), points.max(axis=0)
-    return " x ".join(f"{coordinate(a)}..{coordinate(b)}" for a, b in zip(low, high, strict=True))

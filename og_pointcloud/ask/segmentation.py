@@ -63,7 +63,8 @@ class Segmentation:
         return len(self.labels)
 
     def __repr__(self) -> str:
-        """How many points have each label, the most frequent first, and why the others have none."""
+        """How many points have each label, the most frequent first, and why the others have none; and whether labels
+        had to fit."""
         frequent = sorted(((name, count) for name, count in self.counts().items() if count), key=lambda row: -row[1])
         rows = [(name, f"{count:,}") for name, count in frequent[:SHOWN]]
         if rest := frequent[SHOWN:]:
@@ -72,7 +73,8 @@ class Segmentation:
         name_width = max((len(name) for name, _ in rows), default=0)
         count_width = max((len(count) for _, count in rows), default=0)
         lines = (f"{name:<{name_width}}  {count:>{count_width}}" for name, count in rows)
-        return "\n".join([f"{len(self):,} points", *lines])
+        best = "" if self.calibrated or not frequent else ", each with its best label, fitting or not (no word bank)"
+        return "\n".join([f"{len(self):,} points{best}", *lines])
 
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, span
 from og_pointcloud.fitting.memory import scratch_array
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.kernels import njit
@@ -235,16 +235,20 @@ def stacked_tracks(of_views: Sequence[tuple[NDArray[np.integer] | None, int]]) -
 
 def require_sight(exposed: int, masked: int, scene: Scene) -> None:
     """SceneError where no view shows a point, or no mask does. exposed, masked: how many entries say so."""
+    if exposed and masked:
+        return
+    cameras = np.stack([view.camera.center for view in scene.views]) + scene.points.origin
+    places = f"the cloud spans {span(scene.points.xyz_world)}, the cameras stand at {span(cameras)}"
     if exposed == 0:
         raise SceneError(
             f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
-            "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
+            "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented; "
+            f"{places}"
         )
-    if masked == 0:
-        raise SceneError(
-            f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least "
-            "one: make masks, and check that poses and cloud share one frame"
-        )
+    raise SceneError(
+        f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least "
+        f"one: make masks, and check that poses and cloud share one frame; {places}"
+    )
 
 
 def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], count: int) -> NDArray[np.float64]:
