@@ -296,6 +296,23 @@ def test_a_table_on_disk_is_the_table_in_memory(gaussians: Gaussians, expected: 
     assert_same(table, expected)
 
 
+def test_two_tables_in_a_temporary_folder_do_not_mix(gaussians: Gaussians, expected: MaskTable) -> None:
+    other = gaussians.take(np.arange(len(gaussians))[::-1])
+    with WorkFolder.open(None) as work:
+        work.hold(0, np.inf)  # all is written
+        assert_same(mask_table(gaussians, views(), NEAR, work=work), expected)
+        assert_same(mask_table(other, views(), NEAR, work=work), mask_table(other, views(), NEAR))
+
+
+def test_what_is_not_kept_takes_no_fingerprint(
+    gaussians: Gaussians, expected: MaskTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("og_pointcloud.fitting.mask_table.fingerprint")
+    assert_same(mask_table(gaussians, views(), NEAR), expected)
+    with WorkFolder.open(tmp_path / "kept") as work, pytest.raises(NameError):
+        mask_table(gaussians, views(), NEAR, work=work)
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_replaced_checkpoint_is_the_one_that_the_next_run_finds(tmp_path: Path, held: bool) -> None:
     with killed_run(tmp_path) as work:

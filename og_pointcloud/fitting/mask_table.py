@@ -115,11 +115,12 @@ def mask_table(
         work = WorkFolder(None)
         work.hold(np.inf, np.inf)
     geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near)
-    of_all = fingerprint(*geometry, by_sight, asked)
+    # What is not kept no other run will look for: it needs no fingerprint.
+    of_all = fingerprint(*geometry, by_sight, asked) if work.folder is not None else None
 
     def shown(view: View) -> _ShownView:
         ids = view.mask_map()
-        key = fingerprint(of_all, view_fingerprint(view, ids))
+        key = fingerprint(of_all, view_fingerprint(view, ids)) if of_all is not None else work.number()
 
         def make() -> tuple[NDArray[Any], ...]:
             if not by_sight or thickness is None:

@@ -7,6 +7,7 @@ and end in a checksum; one that is damaged is made anew. There is no index besid
 
 from __future__ import annotations
 
+import itertools
 import math
 import mmap
 import os
@@ -81,7 +82,7 @@ class WorkFolder:
         self._bytes_pending, self._most_pending, self._pending_until = 0, 0.0, 0.0
         self._sound: set[str] = set()  # files written or checked by this run: their checksum is not read again
         self._room = np.empty(0, np.uint8)  # what is left of the block that arrays are packed into
-        self._guard = threading.Lock()
+        self._guard, self._numbers = threading.Lock(), itertools.count()
 
     @classmethod
     @contextmanager
@@ -116,6 +117,10 @@ class WorkFolder:
         """Whether there is a file of these arrays."""
         return (self.place() / f"{name}-{key}{SUFFIX}").exists()
 
+    def number(self) -> str:
+        """A key that is given once: enough for what is not kept beyond this run."""
+        return str(next(self._numbers))
+
     def hold(self, nbytes: float, seconds: float) -> None:
         """Write no file until arrays of more than ``nbytes`` are held, or ``seconds`` have passed: what a killed run
         loses is then made again as soon. The time counts only where the folder outlives the run."""
@@ -126,7 +131,7 @@ class WorkFolder:
         """What ``make`` returns; not made again where the folder has it. Mapped from the file, read-only, or in memory.
 
         name: of the kind and number of the work, for people who look into the folder. key: a `fingerprint` of all that
-        the arrays depend on.
+        the arrays depend on, or a `number`.
         """
         label = f"{name}-{key}{SUFFIX}"
         with self._guard:

@@ -329,7 +329,7 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
         if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
         jx, jy = linearised_at(tx, ty, intrinsics, size)
-        sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
+        sxx, sxy, syy, det = _covariance(scale, rotation, g, pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
         # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
         peak = np.log2(sigma)
@@ -376,24 +376,24 @@ def _in_order(splats, order, ordered):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _covariance(scale, rotation, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
+def _covariance(scale, rotation, g, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
     """(xx, xy, yy, determinant) of a splat's covariance, px^2, linearised at slopes (jx, jy).
 
     The projected axes are the columns of J R_camera R_gaussian S, a 2x3 matrix V; the covariance is V V' + c I.
     """
-    if scale[0] == scale[1] == scale[2]:  # round, as those of a plain cloud are: no rotation changes it
-        lx, ly = px * np.float64(scale[0]), py * np.float64(scale[0])
+    if scale[g, 0] == scale[g, 1] == scale[g, 2]:  # round, as those of a plain cloud are: no rotation changes it
+        lx, ly = px * np.float64(scale[g, 0]), py * np.float64(scale[g, 0])
         sxx, sxy, syy = lx * lx * (1 + jx * jx), lx * ly * jx * jy, ly * ly * (1 + jy * jy)
         det = lx * lx * ly * ly * (1 + jx * jx + jy * jy) + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
         return sxx + LOW_PASS, sxy, syy + LOW_PASS, det
-    qw, qx = np.float64(rotation[0]), np.float64(rotation[1])
-    qy, qz = np.float64(rotation[2]), np.float64(rotation[3])
+    qw, qx = np.float64(rotation[g, 0]), np.float64(rotation[g, 1])
+    qy, qz = np.float64(rotation[g, 2]), np.float64(rotation[g, 3])
     axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
-    vx0, vy0 = _projected_axis(axis, np.float64(scale[0]), pose, px, py, jx, jy)
+    vx0, vy0 = _projected_axis(axis, np.float64(scale[g, 0]), pose, px, py, jx, jy)
     axis = (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx))
-    vx1, vy1 = _projected_axis(axis, np.float64(scale[1]), pose, px, py, jx, jy)
+    vx1, vy1 = _projected_axis(axis, np.float64(scale[g, 1]), pose, px, py, jx, jy)
     axis = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
-    vx2, vy2 = _projected_axis(axis, np.float64(scale[2]), pose, px, py, jx, jy)
+    vx2, vy2 = _projected_axis(axis, np.float64(scale[g, 2]), pose, px, py, jx, jy)
     sxx = vx0 * vx0 + vx1 * vx1 + vx2 * vx2
     syy = vy0 * vy0 + vy1 * vy1 + vy2 * vy2
     sxy = vx0 * vy0 + vx1 * vy1 + vx2 * vy2
