@@ -56,6 +56,14 @@ class World:
         return Camera(WIDTH, HEIGHT, *self.intrinsics, world_to_camera=pose)
 
 
+def edit_poses(folder, change):
+    """Change what a transforms.json holds."""
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
 def make_world(offset=(0.0, 0.0, 0.0), count=3, seed=0):
     rng = np.random.default_rng(seed)
     quaternions = rng.normal(size=(count, 4))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import write_masks
+from capture_files import edit_poses, write_masks
 from scenes import ROOM_SIZE, distance_to_surface, look, room_poses, write_depth, write_rgb
 
 from og_pointcloud.cli import main
@@ -204,20 +204,16 @@ def test_as_many_depth_images_are_fused_as_may_be(tmp_path, monkeypatch, most, f
 
 def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path):
     nerfstudio(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    content["frames"][0]["depth_file_path"] = "../d0.png"
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    edit_poses(tmp_path, lambda content: content["frames"][0].update(depth_file_path="../d0.png"))
     with pytest.raises(SceneError, match="leads out of the capture folder"):
         read_poses(tmp_path)
 
 
 def test_a_depth_folder_beside_the_images_is_found(tmp_path):
     names = nerfstudio(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    for index, frame in enumerate(content["frames"]):
-        del frame["depth_file_path"]
+    edit_poses(tmp_path, lambda content: [frame.pop("depth_file_path") for frame in content["frames"]])
+    for index in range(COUNT):
         np.save(tmp_path / f"{index}.npy", look(room_poses(COUNT)[index], intrinsics=LENS)[0])
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
     add_masks(tmp_path, names, SIZE)
     with pytest.raises(SceneError, match=r"no geometry; .*depth images in depth/"):
         read_capture(tmp_path)

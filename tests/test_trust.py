@@ -22,6 +22,7 @@ from pathlib import Path
 import benchmark_stream
 import numpy as np
 import pytest
+from capture_files import edit_poses
 from copc_files import attributes_of
 from hostile_files import (
     UNBOUNDED_TOKENIZERS,
@@ -248,10 +249,7 @@ def test_a_pose_file_with_a_mark_before_it(tmp_path):
 
 
 def test_a_name_too_long_for_any_file_is_a_missing_image(tiny_capture):
-    file = tiny_capture.folder / "transforms.json"
-    content = json.loads(file.read_text())
-    content["frames"][0]["file_path"] = "i" * 300 + "/view0.png"
-    file.write_text(json.dumps(content))
+    edit_poses(tiny_capture.folder, lambda content: content["frames"][0].update(file_path="i" * 300 + "/view0.png"))
     with pytest.warns(UserWarning, match=r"1 of 6 images are listed but not found, e\.g\. 'i{77}\.\.\.'"):
         assert len(og.read_capture(tiny_capture.folder).views) == 6
 

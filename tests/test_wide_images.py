@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from capture_files import make_world, write_colmap_text, write_features
+from capture_files import edit_poses, make_world, write_colmap_text, write_features
 from scenes import write_image
 
 import og_pointcloud as og
@@ -214,9 +214,7 @@ def test_colmaps_wide_cameras_are_views_too(tmp_path):
 
 def test_depth_of_a_wide_lens_is_read_in_front(tmp_path):
     folder = write_panoramas(tmp_path, "OPENCV_FISHEYE", (256, 256))
-    content = json.loads((folder / "transforms.json").read_text())
-    content["frames"][0]["depth_file_path"] = "depth/0.npy"
-    (folder / "transforms.json").write_text(json.dumps(content))
+    edit_poses(folder, lambda content: content["frames"][0].update(depth_file_path="depth/0.npy"))
     (folder / "depth").mkdir()
     np.save(folder / "depth/0.npy", np.full((256, 256), 2.0, np.float32))
     poses = read_poses(folder)
@@ -227,9 +225,7 @@ def test_depth_of_a_wide_lens_is_read_in_front(tmp_path):
 
 
 def test_depth_of_a_panorama_is_refused(panoramas):
-    content = json.loads((panoramas / "transforms.json").read_text())
-    content["frames"][0]["depth_file_path"] = "depth/0.npy"
-    (panoramas / "transforms.json").write_text(json.dumps(content))
+    edit_poses(panoramas, lambda content: content["frames"][0].update(depth_file_path="depth/0.npy"))
     with pytest.raises(SceneError, match="equirectangular image is not read"):
         read_poses(panoramas)
 
