@@ -6,7 +6,6 @@ import itertools
 import json
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,27 +16,15 @@ import og_pointcloud as og
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.ply import read_ply
 
-KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "seven_redkitchen"
 WORDS = ["apple", "pear", "plum"]
 COMPONENTS = {5123: "<u2", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
-def scene_of(name, folder):
-    if name == "made":
-        return og.load(write_bundle(room(), folder / "room.ogpc"))
-    if not KITCHEN.is_dir():
-        pytest.skip("shared data: seven_redkitchen")
-    xyz = og.read_points(KITCHEN / "points.ply").xyz_world
-    cells = np.unique(np.floor(xyz / 0.9).astype(int), axis=0, return_inverse=True)[1].ravel()
-    ids = np.where(cells % 5 == 0, -1, cells % 23).astype(np.int32)
-    return og.load(write_bundle(make_cloud(xyz, ids, 0.02, 0.06), folder / "kitchen.ogpc"))
-
-
-@pytest.fixture(scope="module", params=["made", pytest.param("seven_redkitchen", marks=pytest.mark.slow)])
-def asked(request, tmp_path_factory):
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
     """A scene, points that carriers of float32 and of whole tenths of millimetres hold exactly, and their labels."""
-    scene = scene_of(request.param, tmp_path_factory.mktemp("scene"))
+    scene = og.load(write_bundle(room(), tmp_path_factory.mktemp("scene") / "room.ogpc"))
     random = np.random.default_rng(1)
     points = scene.xyz + random.normal(size=scene.xyz.shape) * 0.3 * scene.cloud.spacing
     points = (np.round(points * 8192) / 8192).astype(np.float32).astype(np.float64)
@@ -145,7 +132,6 @@ def test_rows_with_nan_stay_rows(asked, tmp_path):
         assert (got.labels[~kept] == -1).all()
 
 
-@pytest.mark.parametrize("asked", ["made"], indirect=True)
 def test_integer_and_half_precision_tensors(asked):
     torch = pytest.importorskip("torch")
     scene = asked[0]

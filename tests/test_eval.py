@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import error_of
 from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 from scenes import NAMES, write_tiny_capture
 
@@ -15,7 +16,6 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
-from og_pointcloud.evaluate.scannet import score_scene
 from og_pointcloud.formats.ply import write_ply
 
 WALL, FLOOR, CHAIR = 1, 2, 5
@@ -63,15 +63,11 @@ def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
 
 def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
     (tmp_path / "bare").mkdir()
-    assert main(["eval", "capture", str(tmp_path / "bare"), str(fitted / "S.ogpc")]) == 2
-    assert "gt.npz is not a file" in capsys.readouterr().err
-    assert main(["eval", "capture", str(fitted / "tiny"), str(fitted / "none.ogpc")]) == 2
-    assert "none.ogpc is not a file" in capsys.readouterr().err
+    bare = ("eval", "capture", tmp_path / "bare", fitted / "S.ogpc")
+    assert "gt.npz is not a file" in error_of(capsys, *bare)
+    assert "none.ogpc is not a file" in error_of(capsys, "eval", "capture", fitted / "tiny", fitted / "none.ogpc")
     np.savez(tmp_path / "bare/gt.npz", names=np.array(NAMES), cls=np.zeros(3, int))
-    assert main(["eval", "capture", str(tmp_path / "bare"), str(fitted / "S.ogpc")]) == 2
-    captured = capsys.readouterr()
-    assert "points, the truth 3" in captured.err
-    assert captured.err.count("\n") == 1
+    assert "points, the truth 3" in error_of(capsys, *bare)
 
 
 def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path):
@@ -180,21 +176,21 @@ def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
     assert set(row.split()[2:]) == {"-"}
 
 
-def test_a_missing_scene_is_one_error(scannet, capsys):
-    assert main(command(scannet, "--scenes", "scene9999_00")) == 2
-    assert "has no labels of 'scene9999_00'" in capsys.readouterr().err
-    (scannet / "p/scene0062_00.ogpc").unlink()
-    assert main(command(scannet)) == 2
-    assert "has no scene0062_00.ogpc" in capsys.readouterr().err
+def test_a_missing_or_empty_scene_is_one_error(scannet, capsys):
+    assert "has no labels of 'scene9999_00'" in error_of(capsys, *command(scannet, "--scenes", "scene9999_00"))
+    prediction = scannet / "p/scene0062_00.ogpc"
+    prediction.write_bytes(b"")
+    assert str(prediction) in error_of(capsys, *command(scannet))
+    prediction.unlink()
+    assert "has no scene0062_00.ogpc" in error_of(capsys, *command(scannet))
     assert main(command(scannet, "--scenes", "scene0000_00")) == 0
 
 
-def test_an_empty_prediction_file_is_one_error(scannet, capsys):
-    (scannet / "p/scene0062_00.ogpc").write_bytes(b"")
-    assert main(command(scannet)) == 2
-    captured = capsys.readouterr()
-    assert "scene0062_00.ogpc" in captured.err
-    assert (captured.out, captured.err.count("\n")) == ("", 1)
+def test_labels_that_are_not_nyu40_are_one_error(scannet, capsys):
+    write_labels(scannet / "raw", "scene0000_00", np.zeros((2, 3)), [WALL, 1191])
+    folders = ("--predictions", scannet / "p", "--text-features", scannet / "w.npz")
+    line = error_of(capsys, "eval", "scannet", scannet / "raw", *folders)
+    assert "labels span 1..1191; expected NYU40" in line
 
 
 def test_points_that_lie_in_one_place_count_each(scannet):
@@ -208,12 +204,3 @@ def test_points_that_lie_in_one_place_count_each(scannet):
     # Said are wall, nothing, floor, floor, floor, floor. Wall: 1 of 3. Floor: 3 of 3 + 1.
     assert scene["class_iou"] == {"1": pytest.approx(1 / 3), "2": 3 / 4}
     assert scene["points"] == 6
-
-
-def test_answers_are_those_of_the_points_that_count():
-    """Point 1 is transparent, point 2 of no class of the ten (a picture), point 4 of none at all."""
-    truth, predicted = np.array([WALL, WALL, 11, CHAIR, 40, CHAIR]), np.array([WALL, WALL, 11, FLOOR, WALL, 0])
-    opacity = np.array([1, 0.05, 1, 1, 1, 1])
-    score = score_scene(predicted, truth, 10, opacity)
-    assert (score.points, score.classes) == (3, (WALL, CHAIR))
-    assert (score.class_iou, score.unknown_share) == ((1, 0), 1 / 3)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import error_of, run
 from labelled_clouds import room
 from og_pointcloud_export import write_bundle
 
@@ -18,7 +19,6 @@ from og_pointcloud_ros.messages import header
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 
 STORE = ros2_types()
 MAKE = rosbags_messages(STORE)
@@ -157,13 +157,8 @@ def test_one_file_is_a_bag_too(scene, tmp_path):
 
 
 def test_a_cloud_already_in_the_map_needs_no_transform(scene, tmp_path):
-    report = label_bag(
-        write_drive(tmp_path / "drive", scene, frame="lidar"),
-        tmp_path / "out",
-        og.Segmenter(scene, WORDS),
-        frame="lidar",
-    )
-    assert report.clouds == CLOUDS
+    source = write_drive(tmp_path / "drive", scene)
+    assert label_bag(source, tmp_path / "out", og.Segmenter(scene, WORDS), frame="lidar").clouds == CLOUDS
 
 
 def test_what_cannot_be_labelled_is_skipped_and_counted(scene, tmp_path):
@@ -184,14 +179,8 @@ def fails(tmp_path, text, source, scene, **options):
 
 
 def test_missing_frames_are_named(scene, tmp_path):
-    source = write_drive(tmp_path / "drive", scene)
-    fails(
-        tmp_path,
-        "from 'lidar' to 'world': 'world' unknown; the frames are base, lidar, map",
-        source,
-        scene,
-        frame="world",
-    )
+    source, text = write_drive(tmp_path / "drive", scene), "'world' unknown; the frames are base, lidar, map"
+    fails(tmp_path, f"from 'lidar' to 'world': {text}", source, scene, frame="world")
 
 
 def test_topics_are_checked(scene, tmp_path):
@@ -217,38 +206,28 @@ def test_a_bag_that_breaks_off(scene, tmp_path):
     fails(tmp_path, "(breaks off|cannot be read as a bag)", source, scene)
 
 
-def test_an_existing_folder_stays(scene, tmp_path):
-    (tmp_path / "out").mkdir()
-    with pytest.raises(og.SceneError, match="exists; expected a new name"):
-        label_bag(write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS))
-    assert list((tmp_path / "out").iterdir()) == []
+def second_cloud_raises(monkeypatch, error):
+    """The labeller does, on the second cloud that it is given."""
+    usual, calls = og.Segmenter.__call__, []
+
+    def label(segmenter, *arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise error
+        return usual(segmenter, *arguments)
+
+    monkeypatch.setattr(og.Segmenter, "__call__", label)
 
 
 def test_an_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
-    usual, calls = og.Segmenter.__call__, []
-
-    def interrupted(segmenter, *arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return usual(segmenter, *arguments)
-
-    monkeypatch.setattr(og.Segmenter, "__call__", interrupted)
+    second_cloud_raises(monkeypatch, KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         label_bag(write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS))
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
 
 
 def test_a_cloud_that_breaks_the_labeller_is_skipped_and_counted(scene, tmp_path, monkeypatch):
-    usual, calls = og.Segmenter.__call__, []
-
-    def breaks_once(segmenter, *arguments):
-        calls.append(arguments)
-        if len(calls) == 2:
-            raise ZeroDivisionError("float division by zero")
-        return usual(segmenter, *arguments)
-
-    monkeypatch.setattr(og.Segmenter, "__call__", breaks_once)
+    second_cloud_raises(monkeypatch, ZeroDivisionError("float division by zero"))
     report = label_bag(write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS))
     assert report.clouds == CLOUDS - 1
     assert dict(report.skipped) == {"ZeroDivisionError: float division by zero": 1}
@@ -274,22 +253,14 @@ def test_transforms_without_sense_are_left_out(scene, tmp_path):
 
 def test_the_command(scene, tmp_path, capsys):
     source = write_drive(tmp_path / "drive", scene, damage=0)
-    command = [
-        "ros-bag",
-        str(source),
-        "-o",
-        str(tmp_path / "out"),
-        "--scene",
-        str(scene.path),
-        "--labels",
-        "apple,pear",
-    ]
-    assert main(command) == 0
-    out = capsys.readouterr().out
+    command = ["ros-bag", source, "-o", tmp_path / "out", "--scene", scene.path, "--labels", "apple,pear"]
+    code, out, _ = run(capsys, *command)
+    assert code == 0
     for text in ("apple", "unknown", "3 clouds", "points a second", "skipped 1 clouds", "next: ros2 bag play"):
         assert text in out
-    assert main(command) == 2
-    assert "exists; expected a new name" in capsys.readouterr().err
+    before = read(tmp_path / "out")
+    assert "exists; expected a new name" in error_of(capsys, *command)
+    assert read(tmp_path / "out") == before
 
 
 @pytest.mark.slow

@@ -1,10 +1,8 @@
 """The node that maps, on stand-ins for rclpy and tf2 (``fake_ros``): it was never run on ROS here."""
 
 import importlib
-import json
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +14,6 @@ from frame_messages import messages_of, place_of, stamp_of
 from og_pointcloud_ros import ros_messages
 from visits import BIN, CHEST, CRATE, SPACE, frames, moved
 
-PACKAGE = Path(__file__).resolve().parents[1] / "plugins" / "og_pointcloud_ros"
 BEFORE, AFTER = [CHEST, BIN, CRATE], [CHEST, BIN, moved(CRATE, (-0.9, 0.5, 0.0))]
 
 
@@ -124,9 +121,3 @@ def test_what_cannot_be_used_is_said_and_the_next_is_used(module):
     assert len(warnings(node)) == 2
     send(node, [second])
     assert settled(node)._queue.mapper.points > 0
-
-
-def test_the_parameter_file_names_every_parameter_with_its_default(module):
-    yaml = pytest.importorskip("ruamel.yaml").YAML(typ="safe")
-    told = yaml.load((PACKAGE / "config" / "map.yaml").read_text())["/**"]["ros__parameters"]
-    assert json.dumps(told, sort_keys=True) == json.dumps(module.PARAMETERS, sort_keys=True)

@@ -240,10 +240,12 @@ def test_main_without_a_scene_says_so(module, rclpy, path, text):
 # The package ----------------------------------------------------------------------------------------------------
 
 
-def test_the_parameter_file_names_every_parameter_with_its_default(module):
+@pytest.mark.parametrize(("file", "node"), [("parameters", "node"), ("map", "map_node")])
+def test_a_parameter_file_names_every_parameter_with_its_default(rclpy, file, node):
     yaml = pytest.importorskip("ruamel.yaml").YAML(typ="safe")
-    told = yaml.load((PACKAGE / "config" / "parameters.yaml").read_text())["/**"]["ros__parameters"]
-    assert json.dumps(told, sort_keys=True) == json.dumps(module.PARAMETERS, sort_keys=True)
+    told = yaml.load((PACKAGE / "config" / f"{file}.yaml").read_text())["/**"]["ros__parameters"]
+    parameters = importlib.import_module(f"og_pointcloud_ros.{node}").PARAMETERS
+    assert json.dumps(told, sort_keys=True) == json.dumps(parameters, sort_keys=True)
 
 
 @pytest.mark.parametrize("name", ["segment", "map"])

@@ -8,7 +8,6 @@ import types
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,6 @@ from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudErr
 from og_pointcloud.formats.colors import label_colors
 
 CLOUDS = tough_clouds()
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="module")

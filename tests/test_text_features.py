@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.text.text_features import read_text_features
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def save(path, **entries):
@@ -77,10 +73,3 @@ def test_a_file_that_unpacks_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr("og_pointcloud.text.text_features.MAX_UNPACKED_BYTES", 100)
     with pytest.raises(FeatureSpaceError, match="at most 100"):
         read_text_features(save(tmp_path / "t.npz", **good()))
-
-
-@pytest.mark.skipif(not DATA.is_dir(), reason="the recorded captures are absent")
-def test_recorded_text_features():
-    vocabulary, space = read_text_features(DATA / "seven_redkitchen" / "text_features.npz")
-    assert (len(vocabulary.names), vocabulary.vectors.shape) == (80, (80, 512))
-    assert space == "openai/clip-vit-base-patch32"

@@ -14,7 +14,7 @@ from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
 from og_pointcloud_zoo.measure import COLOR_NOISE, COLORS, Row, _recolored, measure, parsed_settings
 from og_pointcloud_zoo.outdoors import Matched, Scanner, street_room
-from og_pointcloud_zoo.report import rank_correlation, summary
+from og_pointcloud_zoo.report import summary
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
@@ -146,13 +146,6 @@ def test_the_summary_names_scenes_where_a_baseline_is_better():
     text = summary([lost, drawn])
     assert "better than ours beyond the interval on 1: a-0" in text
     assert "1 of 1 scenes 1 % or more" in text
-
-
-def test_rank_correlation_by_hand():
-    assert rank_correlation([1, 2, 3], [2, 4, 8]) == pytest.approx(1)
-    assert rank_correlation([1, 2, 3], [8, 4, 2]) == pytest.approx(-1)
-    # Spearman's formula without ties: 1 - 6 sum d^2 / (n (n^2 - 1)), here 1 - 6 * 2 / 24.
-    assert rank_correlation([1, 2, 3], [10, 30, 20]) == pytest.approx(0.5)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud_room.shapes import Material, Part, box, cushion_shape, lathe, rotation_about
 
@@ -30,6 +30,16 @@ class Item:
 
     name: str
     parts: tuple[Part, ...]
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """(V, 3) of all its solids, metres."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """(3,) of the box around it."""
+        return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     def moved(self, offset: ArrayLike, yaw: float = 0.0) -> Item:
         """Turned by ``yaw`` radians about z, then shifted by ``offset`` (3,)."""
@@ -233,8 +243,7 @@ def arranged(
     items = []
     for maker, cell in zip(makers, chosen, strict=True):
         item = maker(rng)
-        vertices = np.concatenate([part.vertices for part in item.parts])
-        reach = np.abs(vertices[:, :2]).max(axis=0)
+        reach = np.abs(item.vertices[:, :2]).max(axis=0)
         slack = np.maximum(np.divide(size, cells) / 2 - reach - 0.01, 0.0)
         place = (np.array([cell % columns, cell // columns]) + 0.5) / cells * size - np.divide(size, 2)
         place = place + rng.uniform(-1, 1, 2) * slack

@@ -144,9 +144,8 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
 
 def centred(item: Item) -> Item:
     """Above the origin."""
-    corners = np.concatenate([part.vertices for part in item.parts])
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    return item.moved((-middle[0], -middle[1], 0.0))
+    x, y, _ = item.middle
+    return item.moved((-x, -y, 0.0))
 
 
 def free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> Points:

@@ -45,11 +45,11 @@ class TwoDays:
         names = [item.name for item in room.objects]
         chair, bottle = names.index("chair"), next(k for k, name in enumerate(names) if name in ("bottle", "vase"))
         now, taken, surfaces = dict(enumerate(room.objects)), np.full((1, 2), np.inf), Surfaces(room.objects)
-        places = {"gone": _middle(now.pop(bottle)), "from": _middle(room.objects[chair])}
+        places = {"gone": now.pop(bottle).middle, "from": room.objects[chair].middle}
         for which, item in ((chair, centred(room.objects[chair])), (count, self._objects[-1])):
             place = free_floor(room, surfaces, path, taken)
             now[which], taken = item.moved((*place, 0.0)), np.concatenate([taken, place[None]])
-        self.places = {**places, "to": _middle(now[chair]), "new": _middle(now[count])}
+        self.places = {**places, "to": now[chair].middle, "new": now[count].middle}
         today = replace(room, objects=tuple(now.values()))
         self.before = self._walked(_Day(room, np.arange(count)), frames, rng, 0.0)
         self.after = self._walked(_Day(today, np.array([*now])), frames, rng, DAYS_APART_S)
@@ -74,11 +74,6 @@ class TwoDays:
             masks = ids.astype(np.int32) - 1
             made.append(og.Frame(camera, masks, rows, depth, rgb=seen.image, stamp=stamp + number / 3))
         return made
-
-
-def _middle(item: Item) -> np.ndarray:
-    corners = np.concatenate([part.vertices for part in item.parts])
-    return (corners.min(axis=0) + corners.max(axis=0)) / 2
 
 
 def _ball() -> Item:

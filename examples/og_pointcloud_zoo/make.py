@@ -181,7 +181,7 @@ def _together(room: Room, spans: int) -> Owners:
     """(objects + 1,) the object whose mask each object is in: of the first ``spans`` small things the one beside them,
     of the others their own. The last entry is of what has no mask."""
     owner = np.append(np.arange(len(room.objects)), -1).astype(np.int32)
-    middle = np.array([np.concatenate([part.vertices for part in item.parts]).mean(axis=0) for item in room.objects])
+    middle = np.array([item.vertices.mean(axis=0) for item in room.objects])
     large = [k for k, item in enumerate(room.objects) if item.name not in (*SMALL, *SHELL)]
     for thing in [k for k, item in enumerate(room.objects) if item.name in SMALL][:spans] if large else []:
         owner[thing] = large[int(np.argmin(((middle[large] - middle[thing]) ** 2).sum(axis=1)))]

@@ -144,7 +144,7 @@ def room(rng: Random, seed: int) -> Place:
 
 def _in_the_way(item: Item) -> bool:
     """Whether it stands in the middle of the flat, where the doorway is."""
-    xy = np.concatenate([part.vertices for part in item.parts])[:, :2]
+    xy = item.vertices[:, :2]
     return bool((xy.min(axis=0) < (0.7, 0.8)).all() and (xy.max(axis=0) > (-0.7, -0.8)).all())
 
 
@@ -183,7 +183,7 @@ def _at_wall(rng: Random, group: Group, extra: list[Item], angle: float, distanc
     made = _in_shell(rng, [*group.items, *extra], (5.0, 4.0, 2.6))
     back = 2.0 - group.depth / 2 - 0.02
     objects = tuple(item.moved((0, back, 0)) for item in made.objects)
-    top = max(part.vertices[:, 2].max() for item in group.items for part in item.parts)
+    top = max(item.vertices[:, 2].max() for item in group.items)
     middle = (0.0, back, 0.5 * top)
     return Place(replace(made, objects=objects), _Arc(middle, angle, distance, (0.4 * top, 0.9 * top + 0.5)))
 
@@ -264,7 +264,7 @@ def head_worn(rng: Random, seed: int) -> Place:
         objects = plain.room.objects
         while len(taken) < views:
             item = objects[rng.integers(len(objects))]
-            middle = np.concatenate([part.vertices for part in item.parts]).mean(axis=0)
+            middle = item.vertices.mean(axis=0)
             turn, height = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 1.7)
             for near in np.linspace(2.0, rng.uniform(0.4, 0.9), rng.integers(3, 7)):  # a few steps towards it
                 turn += 0.15 * rng.normal()

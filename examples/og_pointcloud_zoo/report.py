@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from og_pointcloud.evaluate.sweep_report import require_matplotlib
 from og_pointcloud.formats.atomic import replacing, write_file
@@ -63,21 +64,8 @@ def _means(rows: Sequence[Row]) -> str:
         text += f": {', '.join(lost)}" if lost else ""
     said = [(row.reliability, row.miou) for row in rows if row.reliability is not None]
     if len(said) > 2:
-        text += f"; rank correlation of reliability and mIoU {rank_correlation(*zip(*said, strict=True)):.2f}"
+        text += f"; rank correlation of reliability and mIoU {spearmanr(*zip(*said, strict=True)).statistic:.2f}"
     return text
-
-
-def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
-    """Spearman's: of ranks, equal values sharing their mean rank. NaN where one of the two is constant.
-
-    >>> round(rank_correlation([1, 2, 3, 4], [10, 30, 20, 40]), 2)
-    0.8
-    """
-    from scipy.stats import rankdata
-
-    a, b = (rankdata(values) - (len(values) + 1) / 2 for values in (first, second))
-    length = np.sqrt((a**2).sum() * (b**2).sum())
-    return float((a * b).sum() / length) if length else float("nan")
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
@@ -97,7 +85,7 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
         cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)
         said = [row for row in chosen if row.reliability is not None]
         if len(said) > 2:
-            rank = rank_correlation([row.reliability or 0 for row in said], [row.miou for row in said])
+            rank = spearmanr([row.reliability or 0 for row in said], [row.miou for row in said]).statistic
             style["label"] = f"{title}: rank correlation {rank:.2f}"
         own.plot([row.reliability for row in said], [row.miou for row in said], **style)
     ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
