@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from math import exp
 
@@ -303,17 +302,6 @@ def test_templates_narrow_what_prompts_scatter():
 def test_settings_refuse_nonsense():
     with pytest.raises(ValueError, match="sharpness is 0; expected a finite number above 0, by default"):
         ChoosingSettings(sharpness=0)
-
-
-def test_choosing_needs_only_numpy():
-    import subprocess
-
-    code = (
-        "import sys, og_pointcloud.ask.choosing;"
-        "print([m for m in sys.modules if m in ('numba', 'scipy', 'torch', 'cv2')])"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
 
 
 def test_a_ranking_tells_saturated_probabilities_apart():

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -229,22 +227,3 @@ def test_words_are_ranked_as_segment_scores_them():
     assert hit.words({"it": 3 * unit_rows(9)[2]})[0][0] == "it"
     with pytest.raises(FeatureSpaceError, match=r"width 3"):
         hit.words({"narrow": np.ones(3)})
-
-
-def test_picking_works_on_the_base_install(tmp_path):
-    og.write_bundle(room(), tmp_path / "room.ogpc")
-    heavy = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "tqdm")
-    code = f"""
-import sys
-sys.modules.update(dict.fromkeys({heavy}))
-import numpy as np, og_pointcloud as og
-scene = og.load(sys.argv[1])
-camera = og.Camera(64, 48, 40, 40, 32, 24, np.array([[1, 0, 0, -1], [0, 0, -1, 1], [0, 1, 0, 3], [0, 0, 0, 1.0]]))
-x, y, z = scene.xyz[np.flatnonzero(scene.instance_ids == 5)[0]]
-u, v = 40 * (x - 1) / (y + 3) + 32, 40 * (1 - z) / (y + 3) + 24
-hit = og.pick(scene, camera, (u, v))
-assert hit.point is not None and og.pick(scene, hit.xyz_world).point == hit.point
-hit = og.pick(scene, (x, y, z))
-assert hit.instance == 5 and hit.mask(camera).any() and len(hit.words()) == 5
-"""
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "room.ogpc")], check=True, timeout=60)
