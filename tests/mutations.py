@@ -354,6 +354,6 @@ MUTATIONS = (
     ),
     Mutation(
         "paths in files that travel", "bundle/vocabulary.py",
-        'reason = f"{own.name} is', 'reason = f"{own} is', trust("files_that_travel_hold_no_path"),
+        'reason = f"{own} is', 'reason = f"{file} is', trust("files_that_travel_hold_no_path"),
     ),
 )  # fmt: skip

@@ -64,7 +64,7 @@ def _means(rows: Sequence[Row]) -> str:
         text += f": {', '.join(lost)}" if lost else ""
     said = [(row.reliability, row.miou) for row in rows if row.reliability is not None]
     if len(said) > 2:
-        text += f"; rank correlation of reliability and mIoU {spearmanr(*zip(*said, strict=True)).statistic:.2f}"
+        text += f"; rank correlation of reliability and mIoU {spearmanr(said).statistic:.2f}"
     return text
 
 
@@ -85,7 +85,7 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
         cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)
         said = [row for row in chosen if row.reliability is not None]
         if len(said) > 2:
-            rank = spearmanr([row.reliability or 0 for row in said], [row.miou for row in said]).statistic
+            rank = spearmanr([(row.reliability, row.miou) for row in said]).statistic
             style["label"] = f"{title}: rank correlation {rank:.2f}"
         own.plot([row.reliability for row in said], [row.miou for row in said], **style)
     ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
