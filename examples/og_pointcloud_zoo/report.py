@@ -85,7 +85,7 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
         cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)
         said = [row for row in chosen if row.reliability is not None]
         if len(said) > 2:
-            rank = spearmanr([(row.reliability, row.miou) for row in said]).statistic
+            rank = spearmanr([(row.reliability or 0, row.miou) for row in said]).statistic
             style["label"] = f"{title}: rank correlation {rank:.2f}"
         own.plot([row.reliability for row in said], [row.miou for row in said], **style)
     ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
