@@ -2,6 +2,7 @@
 
 import array
 import struct
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -213,8 +214,13 @@ def test_an_empty_result_is_an_empty_cloud(scene):
 
 def test_map_coordinates_survive_as_doubles(result):
     far = result.xyz + 4e6
-    assert np.nanmax(np.abs(from_pointcloud2(to_pointcloud2(result, xyz=far)) - far)) > 0.05
-    np.testing.assert_array_equal(from_pointcloud2(to_pointcloud2(result, xyz=far, double=True)), far)
+    assert np.nanmax(np.abs(from_pointcloud2(to_pointcloud2(result, xyz=far, double=False)) - far)) > 0.05
+    for of_map in (to_pointcloud2(result, xyz=far), replace(result, xyz=far).to_pointcloud2("utm")):
+        np.testing.assert_array_equal(from_pointcloud2(of_map), far)
+    np.testing.assert_array_equal(from_pointcloud2(to_pointcloud2(result, double=True)), result.xyz)
+    near = replace(result, xyz=np.concatenate([result.xyz[:-1], [[1e300, 0, 0]]]))  # a stray reading is no map
+    for cloud in (to_pointcloud2(near), to_pointcloud2(result, xyz=far.astype(np.float32))):
+        assert [field.datatype for field in cloud.fields[:3]] == [7, 7, 7]
     with pytest.raises(og.SceneError, match=r"expected \(202, 3\)"):
         to_pointcloud2(result, xyz=far[1:])
 

@@ -18,6 +18,8 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
+EXACT_WITHIN = 2.0**14
+"""Meters from 0, 16 km, within which float32 counts millimeters."""
 UNLABELLED = 65535
 """Label of a point without one: what vision_msgs/LabelInfo keeps for that among 16-bit ids."""
 ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "data")
@@ -87,7 +89,7 @@ def to_pointcloud2(
     stamp: Any = None,
     *,
     xyz: NDArray[np.floating] | None = None,
-    double: bool = False,
+    double: bool | None = None,
     messages: MessageFactory = plain_messages,
 ) -> Any:
     """A labelled cloud as sensor_msgs/PointCloud2: fields x y z rgb label instance score, 28 bytes a point.
@@ -96,11 +98,15 @@ def to_pointcloud2(
     background, -2 unobserved, -3 too far. score: float32. rgb: a color a label, packed as PCL packs it.
     stamp: a Time message, or nanoseconds since the epoch. messages: the library whose message is made.
     xyz: (N, 3) coordinates in frame_id, where that is not the scene's world: the cloud as the sensor gave it.
-    double: write x y z as float64, which few viewers read; for coordinates, like a map's, that float32 would round.
+    double: write x y z as float64, which few viewers read; None: where float32 would round most of them by millimeters,
+    as those of a map in UTM. ROS counts in meters (REP 103).
     """
     xyz = result.xyz if xyz is None else xyz
     if xyz.shape != (len(result), 3):
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
+    if double is None and xyz.dtype != np.float32:
+        finite = np.abs(xyz[np.logical_and.reduce(np.isfinite(xyz), axis=1)])
+        double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > EXACT_WITHIN
     # One sub-array for x, y, z is filled at once; a view of the same bytes names the three.
     place = "<f8" if double else "<f4"
     colors = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
