@@ -45,6 +45,7 @@ class FeatureSpace:
 
     def accepts(self, other: FeatureSpace) -> bool:
         """Whether vectors of the other space can be compared with vectors of this one."""
+        # What is not known, a name or a width, speaks against nothing.
         same_encoder = self.name == other.name or UNKNOWN_SPACE in (self.name, other.name)
         return same_encoder and (self.width == other.width or 0 in (self.width, other.width))
 

@@ -49,6 +49,7 @@ def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
     """Part of a message that names known words like this one, followed by ``then``; "" where there are none."""
     import difflib  # only when something went wrong
 
+    # Case is the usual slip, and difflib would count each letter of it.
     by_lower = {name.lower(): name for name in known}
     close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
     return f"; did you mean {' or '.join(repr(name) for name in close)}?{then}" if close else ""

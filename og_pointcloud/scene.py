@@ -97,6 +97,7 @@ class Camera:
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
+        # Sizes come before focal lengths, which are held against them.
         if not (1 <= self.width <= LONGEST_SIDE and 1 <= self.height <= LONGEST_SIDE):
             raise SceneError(
                 f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
@@ -299,6 +300,7 @@ class Points:
                 raise SceneError(f"{name} has shape {value.shape}; expected {expected}")
         if self.rgb is not None and self.rgb.dtype != np.uint8:
             raise SceneError(f"rgb is {self.rgb.dtype}; expected uint8: scale colors to 0..255 and convert them")
+        # Half a Gaussian would be drawn as nothing or as anything.
         given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
@@ -398,6 +400,7 @@ class Scene:
                 f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd}); expected one width: "
                 "encode all masks with the same model"
             )
+        # Views are told apart by name wherever something is kept of them: work folders, tables, messages.
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
             twice = next(name for name in names if names.count(name) > 1)

@@ -24,7 +24,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, nami
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
-from og_pointcloud.formats.poses import pose_of_quaternion
+from og_pointcloud.formats.poses import LARGEST, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
@@ -129,7 +129,7 @@ def _number(node: Any, name: str) -> float:
         raise SceneError(f"it has no {name}")
     field = node[name]  # a float, an integer, or an integer that counts steps of a scale
     value = float(field.scaledValue() if hasattr(field, "scaledValue") else field.value())
-    if not abs(value) < 1e30:
+    if not abs(value) <= LARGEST:
         raise SceneError(f"its {name} is {value}; expected a finite number")
     return value
 

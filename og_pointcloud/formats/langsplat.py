@@ -47,6 +47,7 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
     cure = "run the mask and feature extraction on all images"
     require_all(id_files, cure)
     require_all(feature_files, cure)
+    # Each map is decoded once here for the rows that it shows, and let go: hundreds of them would not fit into memory.
     layers = [_layer(ids, features, level) for ids, features in zip(id_files, feature_files, strict=True)]
     empty = [name for name, layer in zip(names, layers, strict=True) if not len(layer.features)]
     if len(empty) == len(names):

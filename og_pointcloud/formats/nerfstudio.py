@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, read_json_object
+from og_pointcloud.formats.poses import LARGEST, OPENGL, PosedFrames, PosedImage, inverse, read_json_object
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -36,7 +36,6 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
 SPHERICAL_MODELS = ("EQUIRECTANGULAR",)
 DEPTH_UNIT_KEYS = ("integer_depth_scale", "depth_unit_scale_factor")
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-LARGEST = float(np.finfo(np.float64).max)
 
 
 def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) -> PosedFrames:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, rigid
+from og_pointcloud.formats.poses import LARGEST, OPENGL, PosedFrames, PosedImage, inverse, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -238,7 +238,7 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
             values[column] = float(text or 0)
         except (TypeError, ValueError):
             values[column] = np.nan
-        if not abs(values[column]) < 1e30:
+        if not abs(values[column]) <= LARGEST:
             raise SceneError(f"{column} is '{text!s:.40}'; expected a number")
     return values
 

@@ -83,6 +83,7 @@ def write_ply(
     """
     path = Path(path)
     with naming(path):
+        # All is converted before the file is opened: what PLY cannot hold leaves nothing behind.
         packed = {name: _packed(name, rows) for name, rows in elements.items()}
         header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
         for name, rows in packed.items():

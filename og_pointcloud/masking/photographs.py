@@ -90,6 +90,7 @@ def _drawn(image: NDArray[np.uint8], ids: NDArray[np.int32]) -> NDArray[np.uint8
     tinted = image.astype(np.float32)
     inside = ids >= 0
     tinted[inside] = (1 - TINT) * tinted[inside] + TINT * label_colors(ids[inside])
+    # A pixel is border where its left or its upper neighbor has another id.
     tinted[:, 1:][ids[:, 1:] != ids[:, :-1]] = 255
     tinted[1:][ids[1:] != ids[:-1]] = 255
     return tinted.astype(np.uint8)
