@@ -17,7 +17,7 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.checking.check import CaptureWarning, check_capture, check_cloud, check_words, warn_of_doubts
 from og_pointcloud.checking.masks import MaskMaps, entropies
 from og_pointcloud.checking.photographs import Photographs
-from og_pointcloud.checking.sample import Comparison, seen
+from og_pointcloud.checking.sample import VIEWS, Comparison, draw_sample, seen
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import SceneError
@@ -71,7 +71,22 @@ def without_colors(scene):
     return replace(scene, points=replace(scene.points, rgb=None))
 
 
+def named(scene, names):
+    return replace(scene, views=tuple(replace(scene.views[0], name=name) for name in names))
+
+
 # Right rooms.
+
+
+@pytest.mark.parametrize("count", [VIEWS - 1, 2 * VIEWS])
+def test_of_images_cut_into_faces_the_fronts_are_asked_where_there_are_enough(count):
+    room = tiled_room(1, views=1, points=100)
+    names = [f"{index:02}/{face}" for index in range(count) for face in ("front", "left", "up")]
+    asked = {view.name.split("/")[1] for view in draw_sample(named(room, names)).views}
+    assert (asked == {"front"}) == (count >= VIEWS)
+    # Cameras of a rig may be called so too.
+    names = [f"{side}/{index:02}" for side in ("front", "left") for index in range(count)]
+    assert {view.name.split("/")[0] for view in draw_sample(named(room, names)).views} == {"front", "left"}
 
 
 @pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])

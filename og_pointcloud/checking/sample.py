@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.formats.faces import CUBE
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
 from og_pointcloud.scene import Camera, Scene, View
@@ -119,7 +120,12 @@ class Seen:
 
 def draw_sample(scene: Scene) -> Sample:
     """Some views and points of a scene. Nothing is read."""
-    order = sorted(range(len(scene.views)), key=lambda index: scene.views[index].name)
+    # Faces of images share few points, and most show few things: of enough images the fronts alone are asked.
+    names = [view.name for view in scene.views]
+    images = [name.removesuffix("front") for name in names if name.endswith("/front")]
+    beside = {image + face for image in images for face in CUBE if face != "front"}
+    ahead = [row for row, name in enumerate(names) if name not in beside]
+    order = sorted(ahead if len(ahead) >= VIEWS else range(len(names)), key=names.__getitem__)
     spread = np.unique(np.linspace(0, len(order) - 1, min(VIEWS, len(order))).round().astype(int))
     places = tuple(order[row] for row in spread)
     cameras = tuple(view.camera for view in scene.views)
