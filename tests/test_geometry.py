@@ -156,6 +156,21 @@ def test_a_sample_of_points_does_not_depend_on_their_order() -> None:
     np.testing.assert_array_equal(sample_of_points(xyz, 5000), np.arange(5000))
 
 
+@pytest.mark.parametrize(("unit", "same"), [(2.0**-10, 1000), (2.0**10, 1000), (0.001, 950), (1000.0, 950)])
+def test_a_sample_of_points_does_not_depend_on_their_unit_of_length(unit: float, same: int) -> None:
+    xyz = np.random.default_rng(1).normal(2, 3, size=(5000, 3)).astype(np.float32)
+    sample = sample_of_points(xyz, 1000)
+    # Powers of two are exact; others round a few points into the next cell.
+    assert len(np.intersect1d(sample_of_points(xyz * np.float32(unit), 1000), sample)) >= same
+
+
+def test_one_far_outlier_or_one_place_leaves_a_sample_of_points() -> None:
+    xyz = np.random.default_rng(2).normal(size=(5000, 3)).astype(np.float32)
+    xyz[0] = 3e38
+    assert len(sample_of_points(xyz, 1000)) == 1000
+    assert len(sample_of_points(np.zeros((50, 3), np.float32), 10)) == 50  # all of one place are drawn, or none
+
+
 def test_chance_of_place_is_even_and_another_for_each_name() -> None:
     xyz = (np.indices((20, 20, 20)).reshape(3, -1).T * 0.01).astype(np.float32)  # a grid: few bits differ
     first, second = chance_of_place(xyz, "a"), chance_of_place(xyz, "b")

@@ -25,6 +25,10 @@ TAMED_BY = 16
 ROWS_AT_ONCE = 1 << 18
 """Points whose neighbours are looked up at once: the look-up returns three times as many bytes as are kept."""
 
+CELLS = 1 << 13
+"""Cells to half the cloud's width in which places are told apart: some to a spacing of 100 million points, and so much
+wider than float32 rounds that another unit of length moves few points into another cell."""
+
 
 @dataclass(frozen=True)
 class Neighbourhood:
@@ -85,10 +89,17 @@ def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
 
 
 def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.float32]:
-    """(n,) float32 in [0, 1), by place and name alone: a sample drawn by it does not depend on the points' order."""
-    # The bits of the coordinates, mixed by odd constants (those of xxHash).
-    bits = np.ascontiguousarray(xyz + np.float32(0)).view(np.uint32)  # -0 becomes 0
-    value = bits[:, 0] * np.uint32(0x9E3779B1) ^ bits[:, 1] * np.uint32(0x85EBCA77) ^ bits[:, 2] * np.uint32(0xC2B2AE3D)
+    """(n,) float32 in [0, 1), by place in the cloud and by name alone: a sample drawn by it depends neither on the
+    order of the points nor on their unit of length."""
+    if not len(xyz):
+        return np.zeros(0, np.float32)
+    # In cells of the cloud's own size; of its medians, lest a far outlier makes all else one cell.
+    place = xyz - np.median(xyz, axis=0)
+    size = np.median(np.abs(place), axis=0).max() or np.abs(place).max() or 1.0
+    near = np.clip(place, -CELLS * size, CELLS * size) / size  # beyond, all is one place
+    cell = np.rint(CELLS * near).astype(np.int32).view(np.uint32)
+    # Their numbers, mixed by odd constants (those of xxHash).
+    value = cell[:, 0] * np.uint32(0x9E3779B1) ^ cell[:, 1] * np.uint32(0x85EBCA77) ^ cell[:, 2] * np.uint32(0xC2B2AE3D)
     value ^= np.uint32(zlib.crc32(name.encode()))
     # Each bit of the input changes half of the bits of the result (finaliser of MurmurHash3, public domain). The upper
     # 24 of them are as many as float32 holds exactly.
