@@ -143,6 +143,10 @@ MUTATIONS = (
         "(support.share_openly > settings.possible_openly)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
+        "one vote of many makes a point sure", "fitting/membership.py",
+        "(support.votes > settings.sure_votes * total)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
+    ),
+    Mutation(
         "certainty without the neighbours", "fitting/membership.py",
         "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
     ),

@@ -402,6 +402,20 @@ def test_what_slips_past_an_edge_is_not_grown_over() -> None:
     assert decide(past, [0] * 9).instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
 
 
+def test_one_ray_that_slips_through_does_not_make_a_point_sure() -> None:
+    """Beyond a gap, four points in the mask of the one view that has a mask of the object and sees them, hardly. The
+    others see them openly, and nothing of the object. Seen alike by all, they would be the object's."""
+    beyond = range(70, 74)
+    views: list[HandView] = [[([*OBJECT, *beyond], ONE)], *[[(OBJECT, ONE)]] * 3, *[[]] * 3]
+    table = hand_table(N, views, [[], *[beyond] * 3, *[OBJECT] * 3])
+    shown = table.exposure.toarray()
+    assert decide(table, [0] * 4).instance_ids[beyond].tolist() == [0] * 4
+    shown[0, beyond] = 0.4  # a vote of 0.16, beside three of 1
+    slipped = decide(replace(table, exposure=csr_array(shown)), [0] * 4)
+    assert slipped.instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+    assert (slipped.share[beyond] == 1).all()
+
+
 def test_the_word_of_one_view_alone_is_noise_where_the_others_would_hardly_all_miss_a_thing() -> None:
     """All views find the object; one finds something where no other has any mask."""
     seen, blob = (OBJECT, ONE), (range(70, 90), ONE)

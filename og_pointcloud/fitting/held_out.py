@@ -117,7 +117,9 @@ def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> t
     are: half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
-    by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0)
+    by_votes = replace(
+        settings.membership, sure_votes=0.0, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0
+    )
     votes = view_votes(table)
     scene = SceneVotes(votes.typical_openness, views_with_masks(table, groups).astype(np.float32))
     return assign_points(table, votes, groups, around, by_votes, scene=scene).instance_ids, groups.count

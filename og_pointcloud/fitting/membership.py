@@ -25,6 +25,9 @@ missed one: how often they do, the scene's other groups tell.
 A point in masks of several groups gets the one with the most votes. But proposers let large things swallow small ones:
 where that group's own views contradict it and a smaller one is sure, the smaller one gets the point.
 
+Nor is a point sure of an instance for which hardly any of its votes are, though no other view that has a mask of it sees
+the point: one ray that slips through would decide.
+
 Where no view sees a point openly, all votes on it are hearsay: rays that slip through a surface agree about what lies
 behind it, and are wrong. Such a point is as its neighbours are, if views know these better, unless it is seen nearly as
 openly as others. What counts as openly is measured by the scene's other points: in surfaces of several noisy layers
@@ -121,7 +124,7 @@ def assign_points(
 
     # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
     # all that look at a car see the same floor through its roof.
-    agreed = (group >= 0) & (share > settings.sure_share)
+    agreed = (group >= 0) & (share > settings.sure_share) & (support.votes > settings.sure_votes * total)
     least_open = settings.open_share * scene.typical_openness
     hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)

@@ -114,8 +114,10 @@ def membership(
     seen = sorted(votes.openness[votes.openness > 0])
     typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
     hidden = votes.openness < settings.open_share * typical
-    hearsay = hidden & (best >= 0) & (share > settings.sure_share)
-    ids = np.where((best >= 0) & (share > settings.sure_share) & ~hidden, best, BACKGROUND).astype(np.int32)
+    for_best = np.where(best >= 0, own[best, np.arange(len(points))], 0.0)
+    agreed = (best >= 0) & (share > settings.sure_share) & (for_best > settings.sure_votes * total)
+    hearsay = hidden & agreed
+    ids = np.where(agreed & ~hidden, best, BACKGROUND).astype(np.int32)
 
     def sureness() -> Array:
         """How much of the votes is for the state of each point."""
