@@ -65,9 +65,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share", "membership.own_vote", "membership.crossing",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
-        "fitting.colors.MOST", "fitting.colors.SURENESS_POWER", "fitting.view_votes.OPENNESS_POWER",
-        "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN",
-        "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "fitting.held_out.TELLS_APART", "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
+        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
+        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""

@@ -25,8 +25,8 @@ missed one: how often they do, the scene's other groups tell.
 A point in masks of several groups gets the one with the most votes. But proposers let large things swallow small ones:
 where that group's own views contradict it and a smaller one is sure, the smaller one gets the point.
 
-Nor is a point sure of an instance for which hardly any of its votes are, though no other view that has a mask of it sees
-the point: one ray that slips through would decide.
+Nor is a point sure of an instance that hardly any of its votes are for, though no view that has a mask of the instance
+speaks against it: one ray that slips through would decide.
 
 Where no view sees a point openly, all votes on it are hearsay: rays that slip through a surface agree about what lies
 behind it, and are wrong. Such a point is as its neighbours are, if views know these better, unless it is seen nearly as
