@@ -39,6 +39,7 @@ SCENES = (
 SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "fitting.held_out.TELLS_APART": ("table", ()),
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
     "fitting.colors.SURENESS_POWER": ("", ()),
