@@ -345,6 +345,16 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
         og.Mapper(cloud=np.eye(3), journal=folder)
 
 
+def test_a_journal_that_cannot_be_written_is_one_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OgPointcloudError, match="file: File exists: check the path"):
+        og.Mapper(journal=tmp_path / "file")
+    (tmp_path / "j" / "frames.log").mkdir(parents=True)
+    mapper = og.Mapper(feature_space=SPACE, journal=tmp_path / "j")
+    with pytest.raises(OgPointcloudError, match="j: Is a directory: check the path"):
+        mapper.integrate(frames(THINGS)[0])
+
+
 def test_a_journal_takes_whatever_frames_are_given_as(tmp_path):
     torch = pytest.importorskip("torch")
     first, second = frames(THINGS)[:2]

@@ -459,6 +459,8 @@ def test_settings_are_checked():
         MaskSettings(level="huge")
     with pytest.raises(OgPointcloudError, match="every is 0"):
         MaskSettings(every=0)
+    with pytest.raises(OgPointcloudError, match=r"words are 'chair'; expected a tuple of them, as \('chair',\)"):
+        MaskSettings(words="chair")  # pyright: ignore[reportArgumentType]
 
 
 def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_path):

@@ -26,6 +26,7 @@ from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.frame import Frame, in_arrays
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.kept_views import KeptView, KeptViews
@@ -58,7 +59,8 @@ class MapJournal:
 
     def __init__(self, folder: str | os.PathLike[str], origin: str) -> None:
         self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        with naming(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
         self._log, self._state, self._origin = self.folder / "frames.log", self.folder / "map.state", origin
         self._file: io.BufferedWriter | None = None
 
@@ -103,14 +105,15 @@ class MapJournal:
         frame = in_arrays(frame)
         if frame.masks is not None and frame.masks.max(initial=0) < 1 << 15:
             frame = replace(frame, masks=frame.masks.astype(np.int16))
-        self._file = self._file or self._log.open("ab")
-        self._file.write(_record(frame))
-        self._file.flush()
-        if self._file.tell() > LOG_BYTES:
-            with replacing(self._state) as file:
-                file.write(_record((self._origin, known)))
-            self._file.close()
-            self._file = self._log.open("wb")
+        with naming(self.folder):
+            self._file = self._file or self._log.open("ab")
+            self._file.write(_record(frame))
+            self._file.flush()
+            if self._file.tell() > LOG_BYTES:
+                with replacing(self._state) as file:
+                    file.write(_record((self._origin, known)))
+                self._file.close()
+                self._file = self._log.open("wb")
 
 
 def _record(value: Any) -> bytes:

@@ -122,6 +122,8 @@ class MaskSettings:
             raise OgPointcloudError(f"features are '{self.features}'; expected one of {', '.join(FEATURES)}")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
+        if isinstance(self.words, str):  # which would be a word for each of its letters
+            raise OgPointcloudError(f"words are {self.words!r:.60}; expected a tuple of them, as ({self.words!r:.60},)")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
                 f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"
