@@ -14,8 +14,15 @@ from scipy.spatial.transform import Rotation
 
 import og_pointcloud as og
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.checking.check import CaptureWarning, check_capture, check_cloud, check_words, warn_of_doubts
-from og_pointcloud.checking.masks import MaskMaps, entropies
+from og_pointcloud.checking.check import (
+    MOST_BLENDED,
+    CaptureWarning,
+    check_capture,
+    check_cloud,
+    check_words,
+    warn_of_doubts,
+)
+from og_pointcloud.checking.masks import MaskMaps, _blended, entropies
 from og_pointcloud.checking.photographs import Photographs
 from og_pointcloud.checking.sample import VIEWS, Comparison, draw_sample, seen
 from og_pointcloud.cli import main
@@ -338,6 +345,17 @@ def test_pictures_of_ids_that_were_blended_are_told(is_jpeg):
     check = doubts(scene)["masks"]
     assert "an id between those of both sides" in check.says
     assert check.repair == ""
+
+
+def test_masks_a_pixel_wide_are_no_blended_ids():
+    """As a proposer makes them of fine textures: their ids lie between those of both sides by chance alone."""
+    random = np.random.default_rng(0)
+    tiles = np.repeat(random.integers(0, 200, (300, 1000)), 8, axis=1)
+    tiles[:, ::8] = random.integers(0, 200, (300, 1000))
+    assert abs(_blended(tiles)) < MOST_BLENDED
+    halves = tiles[:, 1:-1].copy()
+    halves[:, 7::8] = (tiles[:, 7:-8:8] + tiles[:, 9::8]) // 2  # of a smoothed picture
+    assert _blended(halves) > 10 * MOST_BLENDED
 
 
 def test_ids_that_count_from_zero_are_named():

@@ -56,9 +56,9 @@ MOST_BLIND = 0.7
 """Share of the views asked that may see nothing because they belong to another part of a larger map."""
 MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
 """Most feature rows that no pixel shows, most rows that are zero, and most of an image that one mask covers; shares."""
-MOST_BLENDED = 0.02
-"""Share of mask borders, by the median view, with an id between those of both sides. It is 0 in right captures, which
-have none beyond chance, 0.03 to 0.08 in masks stored with losses, and 0.18 or more in interpolated ones."""
+MOST_BLENDED = 0.004
+"""Share of mask borders, by the median view and beyond chance, with an id between those of both sides. It is 0.0015 at
+most in right captures, 0.008 or more in masks stored with losses, and 0.14 or more in interpolated ones."""
 NEARLY_ALL, MOST_UNOBSERVED = 0.95, 0.5
 """Most of the points that one instance may have, and most that no view may see; shares."""
 LEAST_COSINE = 2.5

@@ -40,8 +40,6 @@ LEAST_ENTROPY = 0.05
 SAME_IOU = 0.5
 """Masks of two views show the same where they share more than this of their points, and are each other's best."""
 FEWEST_POINTS = 15
-CHANCE = 0.5
-"""How often the middle one of three ids is between the others: in a third of the cases by chance, and some room."""
 
 
 @dataclass(frozen=True)
@@ -131,16 +129,17 @@ def read_mask_maps(sample: Sample) -> MaskMaps:
 
 def _blended(ids: Ids) -> float:
     """Share of the steps from one id to the next, along some rows, that lead to an id between it and the following
-    pixel's. A map of ids that was resized with interpolation, or stored with losses, has such ids at its borders; where
-    right masks touch, or leave a gap, there are none. 0 where there are no more than chance gives.
+    pixel's, less what chance gives. A map of ids that was resized with interpolation, or stored with losses, has such
+    ids at its borders; where right masks touch, or leave a gap, there are none.
     """
     rows = ids[:: max(1, len(ids) // LONGEST_PX)]
     left, middle, right = rows[:, :-2], rows[:, 1:-1], rows[:, 2:]
+    steps = left != middle
     between = ((left < middle) & (middle < right)) | ((left > middle) & (middle > right))
-    steps = max(int((left != middle).sum()), 1)
-    share = float(between.sum() / steps)
-    # By chance: the next pixel is a step again as often as any pixel is, and CHANCE of such ids lie between.
-    return share if share > CHANCE * steps / max(middle.size, 1) else 0.0
+    # Masks a pixel wide, as of fine textures, are no blends: of three ids the middle one is between in a third of the
+    # cases by chance.
+    three = steps & (middle != right) & (left != right)
+    return float(between.sum() - three.sum() / 3) / max(int(steps.sum()), 1)
 
 
 def entropies(a: Ids, b: Ids) -> tuple[float, float, float]:
