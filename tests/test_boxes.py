@@ -165,6 +165,21 @@ def test_map_coordinates_cost_their_rounding_alone():
     np.testing.assert_allclose(low, xyz.min(axis=0), atol=1e-9)
 
 
+@pytest.mark.parametrize("up", [None, (0.0, 0.6, 0.8)])
+def test_boxes_of_many_sets_are_those_of_each_and_nearly_the_least(up, monkeypatch):
+    """Sets of one point to hundreds, in any order, are worked out a few at a time, padded to the longest of these."""
+    random = np.random.default_rng(5)
+    monkeypatch.setattr(boxes, "PRODUCTS_AT_ONCE", 1 << 17)
+    sets = [random.normal(size=(count, 3)) * random.choice([0.1, 1, 10], 3)
+            for count in random.permutation([1, 1, 2, 3, 4, 7, 20, 20, 21, 30, 60, 61, 200, 900])]  # fmt: skip
+    together = boxes.oriented_boxes(sets, up)
+    for xyz, box in zip(sets, together, strict=True):
+        assert_same_box(box, oriented_box(xyz, up), 1e-9 * max(np.ptp(xyz), 1e-3))
+        assert box.contains(xyz, 1e-9).all()
+        if up is None and 20 <= len(xyz) <= 60:
+            assert box.volume < 1.5 * least_volume_plainly(xyz)
+
+
 def test_upright_box_is_the_least_that_stands():
     xyz, _ = turned_box((3, 2, 1))
     yaw = Rotation.from_euler("z", 0.7).as_matrix()

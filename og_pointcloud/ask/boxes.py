@@ -9,6 +9,7 @@ float64 around the points' middle, so map coordinates of 1e6 cost no more than t
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -122,19 +123,46 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     >>> og.oriented_box([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], up=(0, 0, 1)).size.round(3)
     array([1.414, 1.414, 0.   ])
     """
-    xyz, _ = _distinct(_checked(points))
-    middle = xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2
-    local = xyz - middle
-    axes = _least_volume(local) if up is None else _upright(local, unit_up(up))
-    along = local @ axes.T
-    low, high = along.min(axis=0), along.max(axis=0)
+    return oriented_boxes([points], up)[0]
+
+
+def oriented_boxes(clouds: Sequence[ArrayLike], up: ArrayLike | None = None) -> list[Box]:
+    """`oriented_box` of each of many sets of points, in their order; those of few points are worked out together."""
+    direction = None if up is None else unit_up(up)
+    sets = [_distinct(_checked(points))[0] for points in clouds]
+    boxes: list[Box | None] = [None] * len(sets)
+    waiting = sorted(range(len(sets)), key=lambda k: len(sets[k]))  # alike in size, so that little is padded
+    while waiting:
+        # As many as the longest of these allows; three turns of each are tried at once.
+        count = max(1, PRODUCTS_AT_ONCE // (3 * DIRECTIONS * len(sets[waiting[0]])))
+        count = max(1, PRODUCTS_AT_ONCE // (3 * DIRECTIONS * len(sets[waiting[:count][-1]])))
+        together, waiting = waiting[:count], waiting[count:]
+        for k, box in zip(together, _boxes_around([sets[k] for k in together], direction), strict=True):
+            boxes[k] = box
+    return [box for box in boxes if box is not None]
+
+
+def _boxes_around(sets: Sequence[DoubleArray], up: DoubleArray | None) -> Iterator[Box]:
+    """The box around each of some sets of distinct points (n, 3), n as alike as may be. up: of length 1, or None."""
+    middles = [xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2 for xyz in sets]
+    centered = [xyz - middle for xyz, middle in zip(sets, middles, strict=True)]
+    # A repeated point changes no extent: all sets become as long as the longest.
+    rows = np.arange(max(map(len, sets)))
+    padded = np.stack([local[np.minimum(rows, len(local) - 1)] for local in centered])
     if up is None:
-        order = np.argsort(-(high - low), kind="stable")
-        axes, low, high = axes[order], low[order], high[order]
-    axes = _right_handed(axes, keep_third=up is not None)
-    # A reversed axis keeps the length along it, but not where it begins.
-    center = (local @ axes.T).min(axis=0) + (high - low) / 2
-    return Box(middle + center @ axes, high - low, axes)
+        all_axes = _least_volume(padded, np.stack([_principal_axes(local) for local in centered]))
+    else:
+        all_axes = _turned_about(padded, np.broadcast_to(_upright(up), (len(sets), 3, 3)))
+    for local, middle, axes in zip(centered, middles, all_axes, strict=True):
+        along = local @ axes.T
+        low, high = along.min(axis=0), along.max(axis=0)
+        if up is None:
+            order = np.argsort(-(high - low), kind="stable")
+            axes, low, high = axes[order], low[order], high[order]
+        axes = _right_handed(axes, keep_third=up is not None)
+        # A reversed axis keeps the length along it, but not where it begins.
+        center = (local @ axes.T).min(axis=0) + (high - low) / 2
+        yield Box(middle + center @ axes, high - low, axes)
 
 
 def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
@@ -217,54 +245,65 @@ def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
 # The oriented box -------------------------------------------------------------------------------------------------
 
 
-def _least_volume(local: DoubleArray) -> DoubleArray:
-    """(3, 3) axes, as rows, of a small box around distinct points (n, 3) near the origin."""
-    axes = _principal_axes(local)
-    thickness = THIN * float(np.linalg.norm(np.ptp(local, axis=0)))
+def _least_volume(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
+    """(k, 3, 3) axes, as rows, of a small box around each of k sets of points (k, n, 3) near the origin. axes: (k, 3,
+    3), those to begin with."""
+    axes, thickness = axes.copy(), THIN * np.linalg.norm(np.ptp(local, axis=1), axis=1)
 
-    def volume(rows: DoubleArray) -> float:
-        return float(np.prod(np.ptp(local @ rows.T, axis=0) + thickness))
+    def volumes(sets: NDArray[np.intp], axes: DoubleArray) -> DoubleArray:
+        along = axes @ local[sets].swapaxes(1, 2)
+        return (along.max(axis=2) - along.min(axis=2) + thickness[sets, None]).prod(axis=1)
 
-    least = volume(axes)
+    going = np.arange(len(local))
+    least = volumes(going, axes)
     for _ in range(TURNS):
-        turned = [_turned_about(local, axes[[-shift, 1 - shift, 2 - shift]]) for shift in range(3)]
-        volumes = [volume(rows) for rows in turned]
-        best = int(np.argmin(volumes))
+        each = np.repeat(going, 3)
+        turned = _turned_about(local[each], axes[going][:, _EACH_THIRD].reshape(-1, 3, 3))
+        of_turned = volumes(each, turned).reshape(-1, 3)
+        best = of_turned.argmin(axis=1) + 3 * np.arange(len(going))
         # A box that is no smaller is not worth an odd orientation.
-        if volumes[best] >= (1 - GAIN) * least:
+        smaller = of_turned.ravel()[best] < (1 - GAIN) * least[going]
+        going, best = going[smaller], best[smaller]
+        axes[going], least[going] = turned[best], of_turned.ravel()[best]
+        if not len(going):
             break
-        axes, least = turned[best], volumes[best]
     return axes
 
 
-def _upright(local: DoubleArray, up: DoubleArray) -> DoubleArray:
-    """Axes of the least box whose third axis is up."""
-    # Any direction across up begins; the coordinate axis least along up gives a product far from zero.
+def _upright(up: DoubleArray) -> DoubleArray:
+    """Three axes, the third of which is up."""
+    # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
-    axes: DoubleArray = np.asarray([aside, np.cross(up, aside), up], np.float64)
-    return _turned_about(local, axes)
+    return np.asarray([aside, np.cross(up, aside), up], np.float64)
 
 
 def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
-    """The axes, turned about the third one so that their rectangle around the points has the least area."""
-    flat = local @ axes[:2].T
+    """(k, 3, 3) axes, each three turned about their third one so that their rectangle around their set of points, of
+    (k, n, 3), has the least area."""
+    flat = axes[:, :2] @ local.swapaxes(1, 2)  # (k, 2, n)
     # The farthest points along directions in order are corners of the convex hull in order.
     # They lie half a step off the axes: of a side that is flush already rounding alone would say which end is farthest.
-    at_once = max(1, PRODUCTS_AT_ONCE // len(flat))
+    at_once = max(1, PRODUCTS_AT_ONCE // flat[:, 0].size)
     parts = (_AROUND[start : start + at_once] for start in range(0, DIRECTIONS, at_once))
-    corners = flat[np.concatenate([(part @ flat.T).argmax(axis=1) for part in parts])]
-    sides = np.diff(corners, axis=0, append=corners[:1])
+    farthest = np.concatenate([(part @ flat).argmax(axis=2) for part in parts], axis=1)
+    corners = np.take_along_axis(flat, farthest[:, None], axis=2)
+    sides = np.roll(corners, -1, axis=2) - corners
     lengths = np.hypot(sides[:, 0], sides[:, 1])
-    if not lengths.any():
-        return axes
+    # Sides without length, of directions with one farthest point, go behind the others.
+    order = np.argsort(lengths == 0, axis=1, kind="stable")[:, : max(1, int((lengths > 0).sum(axis=1).max()))]
+    corners, sides = (np.take_along_axis(of, order[:, None], axis=2) for of in (corners, sides))
+    lengths = np.take_along_axis(lengths, order, axis=1)
     # The least rectangle is flush with a side of the hull (Toussaint): one candidate a side.
-    corners, along = corners[lengths > 0], sides[lengths > 0] / lengths[lengths > 0, None]
+    along = sides / np.where(lengths > 0, lengths, 1)[:, None]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    thickness = THIN * float(np.linalg.norm(np.ptp(corners, axis=0)))
-    areas = (np.ptp(along @ corners.T, axis=1) + thickness) * (np.ptp(across @ corners.T, axis=1) + thickness)
-    best = int(areas.argmin())
-    return np.concatenate([np.stack([along[best], across[best]]) @ axes[:2], axes[2:]])
+    thickness = THIN * np.linalg.norm(np.ptp(corners, axis=2), axis=1)[:, None]
+    extents = (direction.swapaxes(1, 2) @ corners for direction in (along, across))
+    first, second = (extent.max(axis=2) - extent.min(axis=2) + thickness for extent in extents)
+    best = np.arange(len(axes)), slice(None), np.where(lengths > 0, first * second, np.inf).argmin(axis=1)
+    turned = np.stack([along[best], across[best]], axis=1) @ axes[:, :2]
+    some = lengths[:, :1, None] > 0  # points at one place have no side
+    return np.concatenate([np.where(some, turned, axes[:, :2]), axes[:, 2:]], axis=1)
 
 
 # Strays -----------------------------------------------------------------------------------------------------------
@@ -275,8 +314,10 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
     # One number a voxel, 21 bits a coordinate: coordinates lie within +-WIDEST, and 1 << 20 makes them positive.
     keys, which = np.unique((voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
     part = np.arange(len(keys))  # a forest: each voxel points at one of its part, a root at itself
-    pairs = [_neighbors(keys, step) for step in _HALF_OF_26]
-    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    wanted = keys + _HALF_OF_26
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    there = keys[place] == wanted
+    first, second = np.nonzero(there)[1], place[there]
     while True:
         a, b = part[first], part[second]
         apart = a != b
@@ -288,17 +329,12 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
             part = part[part]
 
 
-def _neighbors(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows in the sorted keys of every pair of keys that differ by ``step``."""
-    place = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
-    there = np.flatnonzero(keys[place] == keys + step)
-    return there, place[there]
-
-
 _ANGLES = (np.arange(DIRECTIONS) + 0.5) * 2 * np.pi / DIRECTIONS
 _AROUND = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 """(DIRECTIONS, 2) unit vectors."""
-_HALF_OF_26 = [
-    (x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
-]
-"""Key differences of neighboring voxels, one of each opposite pair."""
+_EACH_THIRD = [[-shift, 1 - shift, 2 - shift] for shift in range(3)]
+"""Three axes in turn, each once the third."""
+_HALF_OF_26 = np.array(
+    [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)]
+)[:, None]
+"""(13, 1) key differences of neighboring voxels, one of each opposite pair."""

@@ -17,7 +17,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, unit_up
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, oriented_boxes, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, coordinate, printable
@@ -158,6 +158,12 @@ class Instances(Sequence[Instance]):
 
     def to_records(self) -> list[dict[str, Any]]:
         """A JSON-able dictionary a row (`Instance.to_dict`)."""
+        asked = [row for row in self if row.points and "oriented_box" not in vars(row)]
+        for up in {id(row._up): row._up for row in asked}.values():
+            rows = [row for row in asked if row._up is up]
+            boxes = oriented_boxes([row.xyz[row.main_part] for row in rows], up)  # all at once takes half the time
+            for row, box in zip(rows, boxes, strict=True):
+                vars(row)["oriented_box"] = box
         return [row.to_dict() for row in self]
 
     def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
