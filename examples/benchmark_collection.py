@@ -31,7 +31,6 @@ from og_pointcloud.fitting.memory import memory_in_use, peak_memory
 
 WORDS, SPACE = 400, "made/encoder"
 RECALL_AT, ASKED = 10, 40
-cpu_seconds = 0.0
 SEEN = {
     ("sofa", "hololens_office"): "the truth's word is couch",
     ("bottle", "desk_colmap29"): "a glass drinking bottle before the laptop, open, which the truth leaves out",
@@ -91,23 +90,18 @@ def files(folder: Path, count: int, instances: int, encoder: MadeEncoder) -> Non
     def index() -> og.Collection:
         return og.Collection.index(folder / "scans", atlas, progress=False)
 
-    seconds, collection = timed(index)
-    print(
-        f"index: {seconds:.1f} s, CPU {cpu_seconds:.1f} s ({collection.changes}), {atlas.stat().st_size / 1e6:.0f} MB"
-    )
-    seconds, collection = timed(index)
-    print(f"index again: {seconds:.2f} s, CPU {cpu_seconds:.2f} s ({collection.changes})")
-    for number in range(10):
+    seconds, cpu, collection = timed(index)
+    print(f"index: {seconds:.1f} s, CPU {cpu:.1f} s ({collection.changes}), {atlas.stat().st_size / 1e6:.0f} MB")
+    seconds, cpu, collection = timed(index)
+    print(f"index again: {seconds:.2f} s, CPU {cpu:.2f} s ({collection.changes})")
+    for number in range(min(10, count)):
         (folder / "scans" / f"room{number:04d}.ogpc").unlink()
         changed = folder / "scans" / f"new{number:04d}.ogpc"
         og.write_bundle(cloud(count + number, instances, encoder), changed)
-    seconds, collection = timed(index)
-    print(f"index after changes: {seconds:.2f} s, CPU {cpu_seconds:.2f} s ({collection.changes})")
-    seconds, found = timed(lambda: og.Collection(atlas).find("thing 7"))
-    print(
-        f"open and ask once, as the command does: {seconds:.2f} s, CPU {cpu_seconds:.2f} s, "
-        f"best score {found[0].score:.3f}"
-    )
+    seconds, cpu, collection = timed(index)
+    print(f"index after changes: {seconds:.2f} s, CPU {cpu:.2f} s ({collection.changes})")
+    seconds, cpu, found = timed(lambda: og.Collection(atlas).find("thing 7"))
+    print(f"open and ask once, as the command does: {seconds:.2f} s, CPU {cpu:.2f} s, best score {found[0].score:.3f}")
 
 
 def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud:
@@ -126,9 +120,9 @@ def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, 
     """An atlas written from arrays; the exact search, and LanceDB beside it, which is opened first: what the exact one
     has held would stay with the process."""
     path = folder / "large"
-    seconds, _ = timed(lambda: write_atlas(path, descriptors, instances, encoder))
+    seconds, cpu, _ = timed(lambda: write_atlas(path, descriptors, instances, encoder))
     print(
-        f"\natlas of {descriptors:,} descriptors, written and judged: {seconds:.0f} s, CPU {cpu_seconds:.0f} s, "
+        f"\natlas of {descriptors:,} descriptors, written and judged: {seconds:.0f} s, CPU {cpu:.0f} s, "
         f"{path.stat().st_size / 1e9:.2f} GB"
     )
     lance = lance_rows(path, folder / "lance") if with_lance else []
@@ -162,22 +156,22 @@ def rows_of(name: str, opened: Callable[[], og.Collection]) -> list[Row]:
     """The rows of one way to search: of everything, of half of the place, and of one scene."""
     before = memory_in_use()
     collection = opened()
-    seconds, _ = timed(lambda: collection.find("thing 0"))
-    print(f"{name}: first answer in {seconds:.1f} s, CPU {cpu_seconds:.1f} s")
+    seconds, cpu, _ = timed(lambda: collection.find("thing 0"))
+    print(f"{name}: first answer in {seconds:.1f} s, CPU {cpu:.1f} s")
     rows = []
     half = ([0.0, 0.0, 0.0], [500.0, 1000.0, 10.0])
     ways: dict[str, dict[str, Any]] = {
         "all": {}, "a box around half": {"within": half}, "one scene": {"scenes": "s000001"},
     }  # fmt: skip
     for asked, options in ways.items():
-        times, cpu, found = [], [], []
+        times, cpus, found = [], [], []
         for k in range(ASKED):
             word = f"thing {k}"
-            seconds, best = timed(lambda word=word, options=options: collection.find(word, top=RECALL_AT, **options))
-            times.append(seconds)
-            cpu.append(cpu_seconds)
+            took, cpu, best = timed(lambda word=word, options=options: collection.find(word, top=RECALL_AT, **options))
+            times.append(took)
+            cpus.append(cpu)
             found.append({(finding.scene, finding.instance) for finding in best})
-        rows.append(Row(name, asked, times, cpu, memory_in_use() - before, found))
+        rows.append(Row(name, asked, times, cpus, memory_in_use() - before, found))
     return rows
 
 
@@ -185,9 +179,9 @@ def lance_rows(path: Path, folder: Path) -> list[Row]:
     """LanceDB's rows."""
     from og_pointcloud.collection.lance import write_lance
 
-    seconds, _ = timed(lambda: write_lance(path, str(folder)))
+    seconds, cpu, _ = timed(lambda: write_lance(path, str(folder)))
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    print(f"LanceDB: written and indexed in {seconds:.0f} s, CPU {cpu_seconds:.0f} s, {size / 1e9:.2f} GB")
+    print(f"LanceDB: written and indexed in {seconds:.0f} s, CPU {cpu:.0f} s, {size / 1e9:.2f} GB")
     return rows_of("LanceDB", lambda: og.Collection(path, lance=str(folder)))
 
 
@@ -235,13 +229,11 @@ def made_scenes(
         yield table, np.stack([low, low + 0.3], axis=1)
 
 
-def timed(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds, and the value; also notes the seconds of all cores together, which other programs do not lengthen."""
-    global cpu_seconds
-    start, cpu = time.perf_counter(), time.process_time()
+def timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
+    """Seconds, those of all cores together, which other programs do not lengthen, and the value."""
+    start, start_cpu = time.perf_counter(), time.process_time()
     value = function()
-    cpu_seconds = time.process_time() - cpu
-    return time.perf_counter() - start, value
+    return time.perf_counter() - start, time.process_time() - start_cpu, value
 
 
 if __name__ == "__main__":
