@@ -114,7 +114,9 @@ def page() -> str:
         code = (ROOT / "examples" / f"{exhibit.example}.py").read_text()
         title = (ast.get_docstring(ast.parse(code)) or "").splitlines()[0]
         parts.append(f"## {exhibit.example[:2]} {title}\n")
-        parts += [f"![{exhibit.seen}](gallery/{exhibit.kept_as(name)})" for name in exhibit.pictures]
+        # What is seen stands below, once; in place of a picture its name.
+        for name in exhibit.pictures:
+            parts.append(f"![{Path(name).stem.replace('_', ' ')}](gallery/{exhibit.kept_as(name)})")
         parts.append(f"\n{exhibit.seen} [{exhibit.example}.py](../examples/{exhibit.example}.py)\n")
     return "\n".join(parts)
 

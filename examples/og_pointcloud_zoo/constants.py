@@ -11,6 +11,7 @@ import ast
 import importlib
 import inspect
 import json
+import textwrap
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -286,7 +287,11 @@ def page(results: Sequence[Tried]) -> str:
         half, twice = (f"{result.change(errors):+.4f}" for errors in (result.half, result.twice))
         lines.append(_line(result.constant, half, twice, result.verdict))
     lines += [_line(one, "-", "-", "not tried") for one in rest]
-    return "\n".join(lines) + "\n"
+    return "\n".join(line if line.startswith("|") else _wrapped(line) for line in lines) + "\n"
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _line(one: Constant, half: str, twice: str, verdict: str) -> str:
