@@ -132,11 +132,12 @@ def oriented_boxes(clouds: Sequence[ArrayLike], up: ArrayLike | None = None) -> 
     sets = [_distinct(_checked(points))[0] for points in clouds]
     boxes: list[Box | None] = [None] * len(sets)
     waiting = sorted(range(len(sets)), key=lambda k: len(sets[k]))  # alike in size, so that little is padded
+    lengths = np.array([len(sets[k]) for k in waiting])
     while waiting:
-        # As many as the longest of these allows; three turns of each are tried at once.
-        count = max(1, PRODUCTS_AT_ONCE // (3 * DIRECTIONS * len(sets[waiting[0]])))
-        count = max(1, PRODUCTS_AT_ONCE // (3 * DIRECTIONS * len(sets[waiting[:count][-1]])))
-        together, waiting = waiting[:count], waiting[count:]
+        # As many as fit, all as long as the last of them; three turns of each are tried at once.
+        products = 3 * DIRECTIONS * lengths * np.arange(1, len(waiting) + 1)
+        count = max(1, int(np.searchsorted(products, PRODUCTS_AT_ONCE, side="right")))
+        together, waiting, lengths = waiting[:count], waiting[count:], lengths[count:]
         for k, box in zip(together, _boxes_around([sets[k] for k in together], direction), strict=True):
             boxes[k] = box
     return [box for box in boxes if box is not None]
