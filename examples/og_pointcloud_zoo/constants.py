@@ -40,7 +40,6 @@ SCENES = (
 SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "fitting.held_out.TELLS_APART": ("table", ()),
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
     "fitting.colors.SURENESS_POWER": ("", ()),
@@ -67,7 +66,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share", "membership.own_vote", "membership.crossing",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
-        "fitting.held_out.TELLS_APART", "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
+        "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
         "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
         "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),

@@ -3,9 +3,8 @@
 Too large, and points hide what lies behind their edge; too small, and rays slip through a surface and label what is
 behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are made from every
 other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
-those views show depends on the size too, so the labels of each size are judged with points of every size. (Judged with
-their own size alone, large opaque points would always agree with themselves best.) Taken is the middle of the sizes,
-each counted as it agrees: the best one alone would be left to chance where several agree alike.
+those views show depends on the size too, so the labels of each size are judged with points of every size, and the best
+on average is taken. (Judged with their own size alone, large opaque points would always agree with themselves best.)
 """
 
 from __future__ import annotations
@@ -29,9 +28,6 @@ from og_pointcloud.settings import FitSettings
 FEWEST_VIEWS = 4
 """Views needed: of fewer, a half has one view, which nothing in it contradicts."""
 
-TELLS_APART = 0.01
-"""Agreements that differ by much less are alike: another sample of points moves them by about so much."""
-
 
 @dataclass(frozen=True)
 class ScaleChoice:
@@ -50,7 +46,7 @@ def choose_scale(
     settings: FitSettings,
     journal: Journal,
 ) -> ScaleChoice:
-    """The scale whose labels of half of the views reproduce the masks of the other half best, or a middle of such.
+    """The scale whose labels of half of the views reproduce the masks of the other half best.
 
     spacing: (n,) of the points. near: depth of the near plane. Only some views and points are asked (see settings), but
     all points hide others. Does not depend on the order of views or points.
@@ -83,15 +79,9 @@ def choose_scale(
         for index in range(len(geometry.scales)):
             ids, count = _labels(tables[index][half], around, settings)
             agreements[index] += np.mean([agreement(judge[1 - half], ids, count) for judge in tables]) / 2
-    scale = middle_of(geometry.scales, agreements) if agreements.any() else geometry.middle_scale
+    best = geometry.scales[int(np.argmax(agreements))] if agreements.any() else geometry.middle_scale
     rounded = np.round(agreements, 4).tolist()
-    return ScaleChoice(scale, dict(zip(geometry.scales, rounded, strict=True)))
-
-
-def middle_of(scales: Sequence[float], agreements: NDArray[np.float64]) -> float:
-    """The scale nearest to the geometric mean of all, each counted as its labels agree with held-out views."""
-    sizes, counts = np.log(scales), np.exp((agreements - agreements.max()) / TELLS_APART)
-    return scales[int(np.argmin(np.abs(sizes - np.average(sizes, weights=counts))))]
+    return ScaleChoice(best, dict(zip(geometry.scales, rounded, strict=True)))
 
 
 def note_scale(choice: ScaleChoice, journal: Journal) -> None:
