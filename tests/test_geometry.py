@@ -164,6 +164,14 @@ def test_a_sample_of_points_does_not_depend_on_their_unit_of_length(unit: float,
     assert len(np.intersect1d(sample_of_points(xyz * np.float32(unit), 1000), sample)) >= same
 
 
+def test_a_small_dense_core_leaves_a_sample_of_all() -> None:
+    xyz = np.random.default_rng(3).normal(size=(20_000, 3)).astype(np.float32)
+    xyz[11_000:] *= 50_000  # most points are in the core, whose width is what cells are made by
+    sample = sample_of_points(xyz, 1000)
+    assert 1000 <= len(sample) < 1100
+    assert 300 < (sample >= 11_000).sum() < 600
+
+
 def test_one_far_outlier_or_one_place_leaves_a_sample_of_points() -> None:
     xyz = np.random.default_rng(2).normal(size=(5000, 3)).astype(np.float32)
     xyz[0] = 3e38

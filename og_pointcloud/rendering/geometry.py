@@ -28,6 +28,8 @@ ROWS_AT_ONCE = 1 << 18
 CELLS = 1 << 13
 """Cells to half the cloud's width in which places are told apart: some to a spacing of 100 million points, and so much
 wider than float32 rounds that another unit of length moves few points into another cell."""
+FARTHEST = 1 << 17
+"""Halves of the cloud's width within which there are cells: as many as 32 bits can number."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.floa
     # In cells of the cloud's own size; of its medians, lest a far outlier makes all else one cell.
     place = xyz - np.median(xyz, axis=0)
     size = np.median(np.abs(place), axis=0).max() or np.abs(place).max() or 1.0
-    near = np.clip(place, -CELLS * size, CELLS * size) / size  # beyond, all is one place
+    near = np.clip(place, -FARTHEST * size, FARTHEST * size) / size  # beyond, all is one place
     cell = np.rint(CELLS * near).astype(np.int32).view(np.uint32)
     # Their numbers, mixed by odd constants (those of xxHash).
     value = cell[:, 0] * np.uint32(0x9E3779B1) ^ cell[:, 1] * np.uint32(0x85EBCA77) ^ cell[:, 2] * np.uint32(0xC2B2AE3D)
