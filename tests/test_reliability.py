@@ -188,9 +188,9 @@ def test_it_is_not_judged_twice_for_points_at_one_place(scene: Scene) -> None:
     assert cloud.reliability == pytest.approx(single.reliability, abs=1e-6)
 
 
-def test_the_scene_s_is_the_mean_by_the_root_of_points() -> None:
+def test_the_scene_s_is_the_mean_by_the_fourth_root_of_points() -> None:
     cloud = make_cloud(np.random.default_rng(0).normal(size=(13, 3)), np.array([0] * 9 + [1] * 4))
-    table = replace(cloud.instances, points=np.array([9, 4], np.int32), reliability=np.array([1, 0.5], np.float32))
+    table = replace(cloud.instances, points=np.array([81, 16], np.int32), reliability=np.array([1, 0.5], np.float32))
     assert table.overall_reliability == pytest.approx((3 * 1 + 2 * 0.5) / 5)
     half = replace(table, reliability=np.array([np.nan, 0.5], np.float32))
     assert half.overall_reliability == 0.5
