@@ -118,9 +118,9 @@ class InstanceTable:
 
     @property
     def overall_reliability(self) -> float | None:
-        """Mean reliability, by the fourth root of the instances' points: words count alike in a mIoU, but what few points
-        tell is uncertain. None where no instance's is known. It ranks fits nearly as mIoU does, which needs truth; 1 is
-        not to be expected."""
+        """Mean reliability, by the fourth root of the instances' points: words count alike in a mIoU, but what few
+        points tell is uncertain. None where no instance's is known. It ranks fits nearly as mIoU does, which needs
+        truth; 1 is not to be expected."""
         known = np.isfinite(self.reliability) & (self.points > 0)
         if not known.any():
             return None

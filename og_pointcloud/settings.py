@@ -5,6 +5,7 @@ None of them is a length: distances are in point spacings, weights in pixels, th
 
 from __future__ import annotations
 
+import sys
 from dataclasses import MISSING, dataclass, field, fields, replace
 from math import inf
 from numbers import Integral, Real
@@ -49,14 +50,15 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
     if hint not in (int, float):  # a bool, or settings within settings
         return "" if isinstance(value, hint) else f"a {hint.__name__}"
     # Numbers of numpy's types pass too; True, which Python counts as 1, and NaN, which is not >= 0, do not.
-    least, most = name in ABOVE_ZERO, name in AT_MOST_ONE
-    if isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool):
-        number = float(value)
-        bounded = number <= 1 or not most if number < inf else name in MAY_BE_INFINITE
-        if bounded and number >= 0 and not (number == 0 and least):
+    least, most, whole = name in ABOVE_ZERO, name in AT_MOST_ONE, hint is int
+    numbers: Any = Integral if whole else Real
+    if isinstance(value, numbers) and not isinstance(value, bool):
+        largest = 1 if most else 2**63 - 1 if whole else sys.float_info.max
+        bounded = value <= largest or (value == inf and name in MAY_BE_INFINITE)
+        if bounded and value >= 0 and not (value == 0 and least):
             return ""
-    kind = "a whole number" if hint is int else "a finite number"
-    return kind + (" above 0" if least else " from 0") + " to 1" * most
+    kind = "a whole number" if whole else "a finite number"
+    return kind + (" above 0" if least else " from 0") + " to 1" * most + ", below 2^63" * whole
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from og_pointcloud.text.text_features import read_text_features
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
 WORDS, BANK = "text_features.npz", "word_bank.npz"
-COMMAND = [sys.executable, "-c", "from og_pointcloud.cli import main; raise SystemExit(main())"]
+COMMAND = [sys.executable, "-m", "og_pointcloud"]
 HEADER = ("scene", "mIoU (95 %)", "best baseline", "background called", "unknown", "seconds")
 
 

@@ -226,6 +226,13 @@ def test_points_without_a_box_are_refused(points):
             make(points)
 
 
+def test_a_box_contains_points_of_three_columns_alone():
+    with pytest.raises(SceneError, match=r"points are float64 of shape \(4, 2\); expected numbers \(n, 3\)$"):
+        axis_aligned_box(np.eye(3)).contains(np.zeros((4, 2)))
+    assert axis_aligned_box(np.eye(3)).contains([[0.5, 0.5, 0.5], [np.nan, 0, 0]]).tolist() == [True, False]
+    assert axis_aligned_box(np.eye(3)).contains(np.zeros((0, 3))).shape == (0,)
+
+
 @pytest.mark.parametrize("up", [(0, 0, 0), (1, 0), (np.nan, 0, 1), "z"])
 def test_an_up_without_direction_is_refused(up):
     with pytest.raises(SceneError, match="up is"):

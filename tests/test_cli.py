@@ -21,6 +21,7 @@ from scenes import (
 from test_opengaussian import WIDTH as LEAF_WIDTH
 from test_opengaussian import write_result
 
+import og_pointcloud as og
 from og_pointcloud.ask.labelled_scene import load
 from og_pointcloud.ask.segmentation import SAVED_AS
 from og_pointcloud.bundle.read import read_bundle
@@ -73,6 +74,25 @@ def test_other_points_keep_their_order(fitted, tmp_path, capsys):
     assert np.array_equal(np.load(shuffled)["labels"], np.load(whole)["labels"][order])
 
 
+def test_points_in_a_frame_of_their_own_are_placed_by_a_pose(fitted, tmp_path, capsys):
+    _, bundle = fitted
+    xyz, object_ids = sample_surfaces()
+    pose = np.array([[0.0, -1, 0, 5], [1, 0, 0, -3], [0, 0, 1, 2], [0, 0, 0, 1]])
+    write_ply(tmp_path / "scan.ply", (xyz - pose[:3, 3]) @ pose[:3, :3], COLOURS[object_ids])
+    np.savetxt(tmp_path / "pose.txt", pose)
+    asked = "segment", bundle, "--points", tmp_path / "scan.ply", "--pose", tmp_path / "pose.txt"
+    code, stdout, _ = run(capsys, *asked, "-o", tmp_path / "placed.ply")
+    assert code == 0
+    assert "scan.ply" not in stdout.splitlines()[-1], "view would show the scan where it is not"
+    np.testing.assert_allclose(og.read_points(tmp_path / "placed.ply").xyz_world, xyz, atol=1e-5)
+    for name, command in (("placed", asked), ("whole", asked[:2])):
+        assert run(capsys, *command, "-o", tmp_path / f"{name}.npz")[0] == 0
+    assert np.array_equal(np.load(tmp_path / "placed.npz")["labels"], np.load(tmp_path / "whole.npz")["labels"])
+    np.savetxt(tmp_path / "pose.txt", pose[:3])
+    assert "expected a finite 4x4 matrix" in error_of(capsys, *asked)
+    assert "expected the cloud that it places" in error_of(capsys, "segment", bundle, *asked[4:])
+
+
 def test_segment_json_counts_every_point(fitted, capsys):
     capture, bundle = fitted
     code, stdout, _ = run(capsys, "segment", bundle, "--json")
@@ -109,8 +129,7 @@ def test_a_cut_image_is_one_line(tiny_capture):
     """In a process of its own: OpenCV, which warns too, reads how loud it shall be when it is imported."""
     mask = next(iter((tiny_capture.folder / "masks").iterdir()))
     mask.write_bytes(mask.read_bytes()[:-40])
-    program = "import sys; from og_pointcloud.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "fit", tiny_capture.folder, "-o", tiny_capture.folder / "a.ogpc"]
+    command = [sys.executable, "-m", "og_pointcloud", "fit", tiny_capture.folder, "-o", tiny_capture.folder / "a.ogpc"]
     found = subprocess.run(command, capture_output=True, text=True)
     assert found.returncode == 2
     assert found.stderr.startswith("error: ")

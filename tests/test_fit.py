@@ -432,6 +432,8 @@ def test_masks_that_show_no_point_are_refused(mode: str) -> None:
         (lambda: GroupingSettings(graph_points=0.5), "graph_points is 0.5; expected a whole number above 0"),  # type: ignore[arg-type]
         (lambda: FitSettings(mode="quick"), "mode is 'quick'; expected one of 'grouping', 'fast', 'paper', 'auto'"),  # type: ignore[arg-type]
         (lambda: FitSettings(memory="4GB"), "memory is '4GB'; expected a whole number above 0"),  # type: ignore[arg-type]
+        (lambda: FitSettings(memory=10**400), "memory is 10{400}; expected a whole number above 0, below 2.63"),
+        (lambda: GroupingSettings(join_majority=10**400), "join_majority is 10{400}; expected a finite number from 0,"),
         (lambda: FitSettings(seed=True), "seed is True; expected a whole number from 0"),
         (lambda: FitSettings(membership=None), r"membership is None; expected a MembershipSettings \(FitSettings\)"),  # type: ignore[arg-type]
         (lambda: MatchingSettings(relative="no"), "relative is 'no'; expected a bool, by default False"),  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
+from commands import run
 from frame_messages import messages_of, place_of, stamp_of
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
 from og_pointcloud_ros.frames import image_array
@@ -18,7 +19,7 @@ from rosbags.rosbag2 import Writer
 from visits import BIN, CHEST, CRATE, SPACE, frames, instance_of
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
+from og_pointcloud.cli import main, map_
 from og_pointcloud.errors import SceneError
 
 TOPICS = {"info": "/camera_info", "depth": "/depth/image_rect", "color": "/color/image_rect", "masks": "/masks",
@@ -73,6 +74,17 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys):
     assert "add --resume" in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0
     assert "8 frames" in capsys.readouterr().out
+
+
+def test_reasons_that_are_not_shown_are_counted(tmp_path, capsys, monkeypatch):
+    given = [
+        replace(frame, features=frame.features[:, :k]) if k else frame for k, frame in enumerate(frames(THINGS)[:6])
+    ]
+    monkeypatch.setattr(map_, "SHOWN", 2)
+    _, _, said = run(capsys, "map", write_bag(tmp_path / "drive", given), "-o", tmp_path / "room.ogpc")
+    assert [line for line in said.splitlines() if line.startswith("left out: ")][2:] == [
+        "left out: 3 more, for 3 other reasons"
+    ]
 
 
 def test_frames_of_a_bag_are_those_that_were_recorded(tmp_path):

@@ -155,6 +155,8 @@ def test_a_loop_closure_moves_what_its_frames_brought():
         mapper.correct({0.0: 2 * np.eye(4)})
     with pytest.raises(SceneError, match="poses are a list; expected a dict"):
         mapper.correct([np.eye(4)])
+    with pytest.raises(SceneError, match="a pose is of frame 'a'; expected the frame's stamp"):
+        mapper.correct({"a": np.eye(4)})
     before, pose = mapper._map.points.xyz.copy(), given[0].camera.world_to_camera
     with pytest.raises(SceneError, match=r"stamps are 100, 101; expected those of frames .*, 0 to 13"):
         mapper.correct({100.0: pose, 101.0: pose})
@@ -214,13 +216,23 @@ def test_a_camera_close_to_a_wall_is_of_the_place():
         og.Mapper(cloud=np.concatenate(walls)).integrate(og.Frame(camera, depth=5 * depth))
 
 
+def test_rows_of_a_cloud_that_lie_nowhere_are_left_out():
+    cloud = np.array([[0, 0, 1], [np.nan, 0, 1], [0, 1, 1], [0, np.inf, 1], [1, 0, 1]])
+    with pytest.warns(UserWarning, match="2 of 5 points hold NaN or infinity: the map leaves them out") as said:
+        assert og.Mapper(cloud=cloud).points == 3
+    assert said[0].filename == __file__
+    with pytest.warns(UserWarning, match="1 of 1 points"), pytest.raises(SceneError, match="the cloud has 0 points"):
+        og.Mapper(cloud=cloud[1:2])
+
+
 def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
     with pytest.raises(OgPointcloudError, match="settings is a str; expected an"):
         og.Mapper(settings="grouping")
     with pytest.raises(SceneError, match=r"points are a list of <U1 \(1, 3\)"):
         og.Mapper(cloud=[["a", "b", "c"]])
-    with pytest.raises(SceneError, match="spacing is '1'"):
-        og.Mapper(spacing="1")
+    for spacing in ("1", True):
+        with pytest.raises(SceneError, match=f"spacing is {spacing!r}; expected a positive length"):
+            og.Mapper(spacing=spacing)
     np.save(tmp_path / "cloud.npy", np.zeros((3, 3)))
     with pytest.raises(SceneError, match=r"cloud\.npy: not a geometry file"):
         og.Mapper(cloud=tmp_path / "cloud.npy")

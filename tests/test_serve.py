@@ -142,7 +142,7 @@ def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(viser, bundle):
-    command = [sys.executable, "-u", "-c", "import sys; from og_pointcloud.cli import main; sys.exit(main())", "serve"]
+    command = [sys.executable, "-u", "-m", "og_pointcloud", "serve"]
     process = subprocess.Popen(
         [*command, bundle, "--port", "0"],
         stdout=subprocess.PIPE,

@@ -391,6 +391,12 @@ def test_another_place_is_refused(monday, friday):
     turned = replace(friday, origin=friday.origin + np.array([0.0, 0.0, 1.0]))
     with pytest.raises(SceneError, match="one world frame"):
         og.compare(monday, turned)
+    below = replace(friday, origin=friday.origin - np.array([0.0, 0.0, 50.0]))  # its cameras look down, away from it
+    with pytest.warns(
+        UserWarning, match="looks at none of the earlier one's .* points: the two do not overlap"
+    ) as said:
+        og.compare(monday, below)
+    assert (len(said), said[0].filename) == (1, __file__)
 
 
 def test_another_encoder_is_refused(monday):

@@ -87,8 +87,9 @@ class Box:
         return quaternion_of(self.axes.T)
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """(n,) bool, whether each of (n, 3) points lies inside, or outside by no more than margin along every axis."""
-        from_center = np.asarray(points, np.float64) - self.center
+        """(n,) bool, whether each of (n, 3) points lies inside, or outside by no more than margin along every axis.
+        SceneError for another shape."""
+        from_center = _rows(points) - self.center
         return (np.abs(from_center @ self.axes.T) <= self.size / 2 + margin).all(axis=1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -197,13 +198,18 @@ def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
 
 
 def _checked(points: ArrayLike) -> DoubleArray:
-    given = numbers_of(points)
-    if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0 or given.dtype.kind not in "fiu":
-        raise SceneError(f"points are of shape {given.shape}; expected numbers (n, 3), at least one point, for a box")
-    xyz = given.astype(np.float64)
+    xyz = _rows(points, fewest=1)
     if not np.isfinite(xyz).all():
         raise SceneError("points hold NaN or infinity; expected finite coordinates: leave those points out")
     return xyz
+
+
+def _rows(points: ArrayLike, fewest: int = 0) -> DoubleArray:
+    given = numbers_of(points)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) < fewest or given.dtype.kind not in "fiu":
+        at_least = ", at least one point, for a box" * fewest
+        raise SceneError(f"points are {given.dtype} of shape {given.shape}; expected numbers (n, 3){at_least}")
+    return given.astype(np.float64)
 
 
 def unit_up(up: ArrayLike) -> DoubleArray:

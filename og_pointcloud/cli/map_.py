@@ -11,7 +11,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, replaceable
+from og_pointcloud.cli.common import SHOWN, Parser, add_option, add_output, add_shared, print_next, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
 
@@ -48,8 +48,11 @@ def run(arguments: argparse.Namespace) -> None:
             refused[str(error)] = refused.get(str(error), 0) + 1
     mapper.save(arguments.output)
     shutil.rmtree(work)
-    for why, count in [*frames.dropped.items(), *refused.items()][:12]:
+    left_out = [*frames.dropped.items(), *refused.items()]
+    for why, count in left_out[:SHOWN]:
         print(f"left out: {count} x {why}", file=sys.stderr)
+    if rest := left_out[SHOWN:]:
+        print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)
     objects = mapper.objects()
     print(f"{taken:,} frames, {mapper.points:,} points, {len(objects)} objects")
     print(f"wrote {arguments.output}")

@@ -13,6 +13,7 @@ from typing import Any
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.journal import Journal
 
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
@@ -22,34 +23,43 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     common.add_option(parser, "--points", "CLOUD", "points to label (default: those fitted)", type=Path)
+    pose = "where CLOUD stands in the scene: a text file of 4 x 4 numbers, its coordinates to the scene's"
+    common.add_option(parser, "--pose", "POSE.txt", pose, type=Path)
     files = "labels as .npz, or a colored .ply, .las, .laz or .glb; of splats .glb or .spz"
     common.add_output(parser, "-o", "--output", endings=SAVED_AS, metavar="OUT", help=files)
 
 
 def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.formats.poses import read_numbers
+
+    if arguments.pose and not arguments.points:
+        raise OgPointcloudError(f"--pose is '{arguments.pose}' without --points; expected the cloud that it places")
     journal = Journal(progress=False)
     with journal.stage("load"):
         scene = og.load(arguments.bundle)
     with journal.stage("segment"):
         labels = common.names_in(arguments.labels)
-        result = og.segment(arguments.points or scene, labels, scene, text_features=arguments.text_features)
+        pose = None if arguments.pose is None else read_numbers(arguments.pose, 4)
+        features = arguments.text_features
+        result = og.segment(arguments.points or scene, labels, scene, pose=pose, text_features=features)
+    # Splats, and what a LAS file says of its points, are kept as the file has them: not where a pose moves them.
+    unmoved = None if arguments.pose else arguments.points
     if arguments.output:
         with journal.stage("save"):
             # Formats of splats are written as splats, where the points asked about are some.
-            as_splats = arguments.points and arguments.output.suffix in (".glb", ".spz")
-            points = og.read_points(arguments.points) if as_splats else None
+            points = og.read_points(unmoved) if unmoved and arguments.output.suffix in (".glb", ".spz") else None
             splats = points if points is not None and points.are_gaussians else None
-            result.save(arguments.output, splats, arguments.points)
+            result.save(arguments.output, splats, unmoved)
     report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
     common.print_result(arguments, report, print_segmentation)
     if arguments.json:
         return
     words = common.as_given(arguments, "--labels", "--text-features")
     if arguments.output is None:
-        words += [*common.as_given(arguments, "--points"), "-o", common.labels_file(arguments.bundle)]
+        words += [*common.as_given(arguments, "--points", "--pose"), "-o", common.labels_file(arguments.bundle)]
         common.print_next("segment", arguments.bundle, *words, hint="to keep the labels: ")
     else:
-        cloud = [] if arguments.points is None else ["--cloud", arguments.points]
+        cloud = ["--cloud", unmoved] if unmoved else []
         common.print_next("view", arguments.bundle, *words, *cloud)
 
 

@@ -51,7 +51,10 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
     scene = as_scene(scene)
     cloud = scene.cloud
     if len(cloud) != len(truth.cls):
-        raise SceneError(f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected one each")
+        raise SceneError(
+            f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected the points of the truth, in "
+            "its order: fit the capture's own cloud, without --gaussians, or write gt.npz for the points of this file"
+        )
     result = segment(scene, None, text_features=text_features)
     return Answer(truth.class_of(result.labels, result.names), result.instances, cloud.xyz, cloud.spacing)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
+LABEL_FINITE = "save as .ply or .npz, which can hold them, or label points[np.isfinite(points).all(axis=1)] alone"
 """The cure where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 

@@ -16,6 +16,7 @@ table. Whatever lies where the earlier visit never looked is neither new nor old
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -157,7 +158,7 @@ def compare_visits(
 
 
 def _require_one_frame(asked: Presence) -> None:
-    """SceneError where hardly any point that is looked at again is where it was."""
+    """SceneError where hardly any point that is looked at again is where it was; a warning where none is looked at."""
     still, through = np.count_nonzero(asked.present), np.count_nonzero(asked.odds < 0)
     met = np.count_nonzero(asked.hidden | (asked.odds != 0))
     if through > OTHER_FRAME * (still + through) or still < LEAST_STILL * met:
@@ -166,6 +167,9 @@ def _require_one_frame(asked: Presence) -> None:
             "through; expected few changes: the two do not lie in one world frame, or are of two places: register "
             "their poses first"
         )
+    if not met:
+        what = f"the later visit looks at none of the earlier one's {len(asked.odds):,} points: the two do not overlap"
+        warnings.warn(f"{what}, or do not lie in one world frame, so nothing is known of changes", stacklevel=4)
 
 
 @dataclass(frozen=True)

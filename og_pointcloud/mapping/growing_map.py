@@ -9,10 +9,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthImage
@@ -152,7 +154,9 @@ class GrowingMap:
         """Move what the frames of these stamps brought: stamp -> corrected world_to_camera, from world coordinates."""
         corrected = {}
         for stamp, pose in poses.items():
-            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose))
+            if not isinstance(stamp, Real):
+                raise SceneError(f"a pose is of frame {stamp!r}; expected the frame's stamp, a number")
+            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose))
             corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
         self._warn_of_strange(corrected.keys())
         for index, (stamp, old) in enumerate(self.anchors):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
@@ -67,7 +68,8 @@ class Mapper:
     """See the module.
 
     start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: known geometry,
-    so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
+    so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes; rows with
+    NaN or infinity are left out with a warning.
     spacing: of a map that starts empty, world lengths; None: by the first depth image. feature_space: the name of the
     masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); one that holds it already is
     gone on with.
@@ -96,7 +98,7 @@ class Mapper:
     ) -> None:
         if start is not None and cloud is not None:
             raise SceneError("both a map and a cloud are given; expected one of them: the map has points of its own")
-        if spacing is not None and not (isinstance(spacing, Real) and 0 < spacing < np.inf):
+        if spacing is not None and not (isinstance(spacing, Real) and spacing is not True and 0 < spacing < np.inf):
             raise SceneError(f"spacing is {spacing!r}; expected a positive length, or None")
         self.settings = fit_settings(settings)
         self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
@@ -109,7 +111,7 @@ class Mapper:
         if self._base is not None:
             self._go_on(self._base)
         elif cloud is not None:
-            points = cloud if isinstance(cloud, Points) else Points.from_world(world_points(cloud))
+            points = cloud if isinstance(cloud, Points) else Points.from_world(_placed(world_points(cloud)))
             self._know(points, self._space, None, grows=False)
         self._journal = None if journal is None else self._resumed(MapJournal(journal, self._began_with))
 
@@ -302,3 +304,12 @@ class Mapper:
         updated = merge(earlier, later, found, "frames", known.stamp)
         self._changes = updated.changes
         return updated.cloud
+
+
+def _placed(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rows (n, 3) that are finite, as `read_points` keeps of a file."""
+    placed = np.isfinite(xyz).all(axis=1)
+    if not placed.all():
+        what = f"{np.count_nonzero(~placed)} of {len(xyz)} points hold NaN or infinity: the map leaves them out"
+        warnings.warn(what, stacklevel=3)
+    return xyz[placed]
