@@ -51,7 +51,7 @@ def tinted(scene: og.LabelledScene, tints: Mapping[int, Sequence[int]]) -> np.nd
 
 def written(image: np.ndarray, entry: MapObject, what: str, color: tuple[int, int, int]) -> None:
     """Writes above an object what it is, and what became of it."""
-    ((u, v),), _ = camera.project((entry.place + np.array([0, 0, 0.5 * entry.size[2] + 0.05]))[None])
+    ((u, v),), _ = camera.project(np.array([[*entry.place[:2], entry.box.high[2] + 0.05]]))
     text = f"{name_of(entry)} {what}"
     for thickness, shade in ((6, (255, 255, 255)), (2, color)):
         cv2.putText(image, text, (round(u) - 6 * len(text), round(v) - 12), FONT, 0.7, shade, thickness, cv2.LINE_AA)

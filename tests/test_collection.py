@@ -200,6 +200,14 @@ def test_places_are_those_of_the_instances(folder):
 def test_only_what_changed_is_read_again(folder, monkeypatch):
     collection = indexed(folder, many(4))
     names = collection.scenes
+    link = folder / "link.ogpc"
+    link.symlink_to(folder / f"{names[2]}.ogpc")
+    index(folder, folder.parent / "atlas", progress=False)
+    link.unlink()
+    link.symlink_to("a drive that is not mounted")
+    changes = index(folder, folder.parent / "atlas", progress=False)
+    assert [name for name, _ in changes.left_out] == ["link"]
+    link.unlink()
     assert collection.changes is not None
     assert collection.changes.added == names
     (folder / f"{names[0]}.ogpc").unlink()

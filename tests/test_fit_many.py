@@ -10,11 +10,12 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +183,16 @@ def test_a_fit_whose_worker_dies_is_tried_once_more(captures, tmp_path, times, s
     (fit,) = og.fit_many(captures[:1], tmp_path, workers, progress=False)
     assert (fit.state, workers.left) == (state, 0)
     assert ("its worker died (BrokenProcessPool" in fit.cause) == (state == "failed")
+
+
+def test_a_pool_that_breaks_costs_only_what_it_had_left(captures, tmp_path):
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        (fit,) = og.fit_many(captures[:1], tmp_path, pool, progress=False)
+        pool.submit(die, 0).exception()
+        fits = og.fit_many(captures, tmp_path, pool, progress=False)
+    assert fit.state == "fitted"
+    assert [each.state for each in fits] == ["was there", "failed"]
+    assert "its worker died (BrokenProcessPool" in fits[1].cause
 
 
 def test_processes_end_with_the_one_that_started_them():

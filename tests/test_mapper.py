@@ -21,6 +21,7 @@ from og_pointcloud.mapping.frame_queue import FrameQueue
 from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.rendering.geometry import neighbourhood
 
 THINGS = [CHEST, BIN, CRATE]
 ELSEWHERE = moved(CRATE, (-0.9, 0.5, 0.0))
@@ -74,6 +75,9 @@ def test_objects_have_the_ids_of_the_snapshot(grown):
         entry = objects[instance_of(cloud, thing)]
         assert np.abs(entry.place - (np.array(thing.low) + np.array(thing.size) / 2)).max() < 0.2
         assert entry.state == "present"
+        points = cloud.xyz_world[cloud.instance_ids == entry.id]
+        assert entry.box.contains(points, 0.05).mean() > 0.99
+        assert np.abs(entry.box.size - thing.size).max() < 0.1
     assert {*objects} <= {k for change in changes for k in (*change.new, *change.updated)}
 
 
@@ -110,6 +114,7 @@ def test_what_left_is_said_to_have_stood_where_all_of_it_did():
     (gone,) = (entry for entry in mapper.objects() if entry.state == "gone")
     assert gone.id == known
     assert np.linalg.norm(gone.place - stood) < 0.1
+    assert np.abs(gone.box.center - (np.array(high.low) + np.array(high.size) / 2)).max() < 0.1
 
 
 def test_a_missed_detection_removes_nothing():
@@ -341,7 +346,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
                 os.kill(process.pid, signal.SIGKILL)
                 break
     torn = folder / "frames.log"
-    torn.write_bytes(torn.read_bytes() + b"OGF2half a frame")
+    torn.write_bytes(torn.read_bytes() + map_journal.MAGIC + b"half a frame")
     mapper = og.Mapper(feature_space=SPACE, journal=folder)
     assert mapper.last_stamp >= done
     for frame in given:
@@ -379,6 +384,54 @@ def test_a_journal_takes_whatever_frames_are_given_as(tmp_path):
     again = og.Mapper(feature_space=SPACE, journal=tmp_path)
     assert again.points == whole.points
     assert [thing.points for thing in again.objects()] == [thing.points for thing in whole.objects()]
+
+
+def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
+    given = [replace(frame, stamp=float(k // 2)) for k, frame in enumerate(frames(THINGS)[:4])]  # two cameras at a time
+    mapper, _ = mapped(given, journal=tmp_path)
+    turn = np.eye(4)
+    turn[:3, 3] = 0.3, 0.0, 0.0
+    mapper.correct({0.0: given[0].camera.world_to_camera @ turn})
+    again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    np.testing.assert_array_equal(again._map.points.xyz, mapper._map.points.xyz)
+    assert [thing.views for thing in again.objects()] == [thing.views for thing in mapper.objects()]
+    assert again._map.sequence == mapper._map.sequence
+
+
+def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path):
+    resource = pytest.importorskip("resource")
+    first, second, third = frames(THINGS)[:3]
+    mapper, _ = mapped([first], journal=tmp_path)
+    limits, points = resource.getrlimit(resource.RLIMIT_FSIZE), mapper.points
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "frames.log").stat().st_size + 1000, limits[1]))
+        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the room there"):
+            mapper.integrate(second)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert mapper.points == points, "a frame that was not written changed the map"
+    mapper.integrate(third)
+    again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    assert (again.last_stamp, again.points) == (third.stamp, mapper.points)
+
+
+def test_points_that_came_are_labelled_by_their_own_neighbours(monkeypatch):
+    """As many came as were not seen: the neighbourhood of the map that was gone on with is not that of these."""
+    base, _ = mapped(frames(THINGS)[:6])
+    mapper, _ = mapped(frames(THINGS)[:1], base.snapshot())
+    known = mapper._map
+    lacking = len(mapper._rows) - int(np.isfinite(known.presence.seen_at[: known.points.n]).sum())
+    came = 50.5 + np.stack([np.arange(lacking), *np.zeros((2, lacking))], axis=1)
+    known.points.add((known.points.edge * came).astype(np.float32), np.zeros((lacking, 3), np.uint8), 0)
+    known.grow()
+    known.presence.seen_at[known.points.n - lacking : known.points.n] = 0.0
+    module, given = sys.modules["og_pointcloud.mapping.mapper"], []
+    monkeypatch.setattr(module, "labelled", lambda *arguments: given.append(arguments))
+    monkeypatch.setattr(og.Mapper, "_folded", lambda *arguments: None)
+    mapper._label(known)
+    ((_, rows, around, settings),) = given
+    assert len(rows) == len(mapper._rows) > lacking > 0
+    np.testing.assert_array_equal(around.index, neighbourhood(known.points.xyz[rows], settings.geometry).index)
 
 
 def test_a_queue_never_blocks_and_says_what_it_drops():

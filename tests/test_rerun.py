@@ -3,7 +3,9 @@
 import subprocess
 import sys
 from contextlib import nullcontext
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from labelled_clouds import make_cloud
 
 from og_pointcloud.cli import main
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
-from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
 
 
 def two_walls():
@@ -87,6 +89,17 @@ def test_an_instance_appears_with_the_first_view_that_shows_it(fitted, monkeypat
     masks = [what[0] for _, path, what in recording.logged if path == "world/camera/masks"]
     assert len(masks) == 3
     assert [path for _, path, _ in recording.logged].count("world/camera/image") == 3
+
+
+def test_what_the_lens_did_not_see_is_in_no_mask(monkeypatch):
+    rerun = MagicMock()
+    monkeypatch.setitem(sys.modules, "rerun", rerun)
+    spec = find_spec("og_pointcloud.show.rerun_file")
+    module = module_from_spec(spec)  # known to no one else, as it holds the stand-in
+    spec.loader.exec_module(module)
+    camera = Camera(3, 1, 40, 40, 1.5, 0.5, np.eye(4))
+    module.RerunSink(MagicMock()).frame(0, camera, None, np.array([[NOT_SEEN, -1, 0]]))
+    assert rerun.SegmentationImage.call_args.args[0].tolist() == [[0, 0, 1]]
 
 
 def test_the_file_is_whole_and_nothing_else_is_left(fitted, tmp_path):

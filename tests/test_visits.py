@@ -410,6 +410,9 @@ def test_another_encoder_is_refused(monday):
 def test_a_damaged_record_is_refused(monday):
     with pytest.raises(OgPointcloudError, match="record of its visits is damaged"):
         MapRecord.of(replace(monday, provenance={"map": {"visits": 3}}))
+    empty = {"visits": [], "last_seen": {}, "moved_from": {}, "gone": {}}
+    with pytest.raises(OgPointcloudError, match="has no visit; expected one or more"):
+        MapRecord.of(replace(monday, provenance={"map": empty}))
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -119,9 +119,7 @@ def _fit_all(
     fits: dict[Path, CaptureFit] = {}
     for attempt in ("fit", "fit again"):
         pending = [capture for capture in todo if capture not in fits or fits[capture].worker == LOST]
-        futures = {
-            workers.submit(_try_fit, str(capture), str(todo[capture]), options, share): capture for capture in pending
-        }
+        futures = {_submitted(workers, capture, todo[capture], options, share): capture for capture in pending}
         try:
             for future in with_bar(as_completed(futures), attempt, len(futures), progress and len(futures) > 0):
                 fits[futures[future]] = _outcome(future, futures[future], todo[futures[future]])
@@ -129,6 +127,15 @@ def _fit_all(
             for future in futures:  # on an interrupt, those that have not begun
                 future.cancel()
     return fits
+
+
+def _submitted(workers: Executor, capture: Path, output: Path, options: FitOptions, share: Share) -> Future[CaptureFit]:
+    try:
+        return workers.submit(_try_fit, str(capture), str(output), options, share)
+    except BrokenExecutor as error:  # a pool of processes takes nothing more once one of them has died
+        broken: Future[CaptureFit] = Future()
+        broken.set_exception(error)
+        return broken
 
 
 def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> CaptureFit:

@@ -84,8 +84,8 @@ def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progr
 
 def _is_same(file: Path, entry: SceneEntry) -> bool:
     """Whether a file has the size and date that it had when it was indexed: then it is not even opened."""
-    state = file.stat()
-    return (state.st_size, state.st_mtime_ns) == (entry.bytes, entry.modified)
+    state = file.stat() if file.is_file() else None  # a link may lead nowhere
+    return state is not None and (state.st_size, state.st_mtime_ns) == (entry.bytes, entry.modified)
 
 
 def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:

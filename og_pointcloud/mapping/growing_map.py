@@ -40,7 +40,7 @@ READINGS_PER_SPACING = 1.5
 MOST_ODDS = 3.0
 """Frames that a point's history counts for at most, for it or against it."""
 RECENT_FRAMES = 4096
-"""Stamps of frames that are remembered, so that frames that a journal still holds are not integrated twice."""
+"""Stamps of frames that are remembered: they tell since when an object stands where it is."""
 
 
 @dataclass
@@ -150,14 +150,13 @@ class GrowingMap:
         """(3,) middle of points, world coordinates: the median, as votes give an object some points far off it."""
         return np.median(self.points.xyz[rows].astype(np.float64), axis=0) + self.origin
 
-    def correct(self, poses: Mapping[float, ArrayLike]) -> None:
-        """Move what the frames of these stamps brought: stamp -> corrected world_to_camera, from world coordinates."""
-        corrected = {}
-        for stamp, pose in poses.items():
-            if not isinstance(stamp, Real):
-                raise SceneError(f"a pose is of frame {stamp!r}; expected the frame's stamp, a number")
-            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose))
-            corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
+    def correct(self, poses: Mapping[float, ArrayLike]) -> dict[float, NDArray[np.float64]]:
+        """Move what the frames of these stamps brought: stamp -> corrected world_to_camera, from world coordinates.
+        Returns the poses, checked."""
+        if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
+            raise SceneError(f"a pose is of frame {strange[0]!r}; expected the frame's stamp, a number")
+        cameras = {float(t): Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose)) for t, pose in poses.items()}
+        corrected = {stamp: in_local_frame(camera, self.origin).world_to_camera for stamp, camera in cameras.items()}
         self._warn_of_strange(corrected.keys())
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:
@@ -175,6 +174,7 @@ class GrowingMap:
             self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
         # Snapshots are remembered by the sequence: they are made anew after a correction.
         self.count(self.stamp)
+        return {stamp: camera.world_to_camera for stamp, camera in cameras.items()}
 
     def _warn_of_strange(self, stamps: Collection[float]) -> None:
         """Warn of stamps of no frame, or, where all are such, SceneError: seconds were taken for nanoseconds, say."""

@@ -42,14 +42,14 @@ MOST_ROWS = 1000
 class Look:
     """How a thing looked, and where, so that it is recognized when it comes back. descriptors: (r, D) float32 unit
     rows, r = 0 where no mask gave a feature. spread: their s, as in the module's text. place: (3,) middle of its
-    points, world coordinates. color: (3,) median, or None. size: (3,) along the axes; length: of the longest side,
-    without outliers."""
+    points, color: (3,) their median, or None. bounds: (2, 3) their lowest and highest coordinates. length: of the
+    longest side, without outliers. Places are in world coordinates."""
 
     descriptors: NDArray[np.float32]
     spread: float
     place: NDArray[np.float64]
     color: NDArray[np.float64] | None
-    size: NDArray[np.float64]
+    bounds: NDArray[np.float64]
     length: float
 
     @classmethod
@@ -59,13 +59,14 @@ class Look:
         spread: float,
         place: NDArray[np.float64],
         xyz: NDArray[np.float32],
+        origin: NDArray[np.float64],
         rgb: NDArray[np.uint8 | np.float32] | None,
     ) -> Look:
-        """The look of points xyz (n, 3), at least one, in any frame that has the world's axes; rgb (n, 3) or None."""
+        """The look of points xyz (n, 3), at least one, world = xyz + origin; rgb (n, 3) or None."""
         sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)  # votes give a thing some points far off it
         color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
-        size = np.ptp(xyz.astype(np.float64), axis=0)
-        return cls(descriptors, spread, place, color, size, float(sides.max()))
+        bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)], np.float64) + origin
+        return cls(descriptors, spread, place, color, bounds, float(sides.max()))
 
     def has_color_of(self, other: Look, most: float = SAME_COLOR, shift: NDArray[np.float64] | float = 0.0) -> bool:
         """Whether the two may be of one thing by their colours; True where these are not known. shift: difference that

@@ -1,14 +1,16 @@
 """A map on disk while it grows: a kill -9 at any moment loses at most the frame being integrated.
 
-The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each integrated frame
-is appended; a torn last one is cut off. ``map.state`` is the whole map at some frame, replaced in one step; the log
-then begins anew. A mapper that is started with the folder reads the state and integrates the frames of the log again:
-this gives the very map that was left, and the space on disk grows with the map, not with time. Nothing is pickled: a
-record is a tree of plain values and of the dataclasses named in KINDS, as JSON, and the arrays in it, as .npy.
+The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each change, a frame
+or a correction, is appended with its number; a torn last one is cut off. ``map.state`` is the whole map at some number,
+replaced in one step; the log then begins anew. A mapper that is started with the folder reads the state and makes the
+changes of the log again: this gives the very map that was left, and the space on disk grows with the map, not with
+time. Nothing is pickled: a record is a tree of plain values and of the dataclasses named in KINDS, as JSON, and the
+arrays in it, as .npy.
 """
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -46,9 +48,13 @@ KINDS = {
 """Dataclasses that a record may hold, by name: nothing else is ever made from a file."""
 HEAD = struct.Struct("<4sQI")
 """Of a record: MAGIC, bytes that follow, and their CRC-32."""
-MAGIC = b"OGF2"
+MAGIC = b"OGF3"
 LOG_BYTES = 1 << 27
-"""Bytes of frames after which the whole map is written and the log begins anew."""
+"""Bytes of changes after which the whole map is written and the log begins anew."""
+
+
+Poses = dict[float, NDArray[np.float64]]
+"""A correction: stamp -> world_to_camera (4, 4)."""
 
 
 class MapJournal:
@@ -62,7 +68,7 @@ class MapJournal:
         with naming(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._log, self._state, self._origin = self.folder / "frames.log", self.folder / "map.state", origin
-        self._file: io.BufferedWriter | None = None
+        self._file: io.FileIO | None = None
 
     def state(self) -> GrowingMap | None:
         """The last whole map; None where there is none yet."""
@@ -81,9 +87,9 @@ class MapJournal:
             )
         return known
 
-    def frames(self) -> Iterator[Frame]:
-        """The frames since that map, in their order. A torn one at the end is cut off, so that new ones follow whole
-        ones."""
+    def changes(self) -> Iterator[tuple[int, Frame | Poses]]:
+        """The changes in the log, in their order, with their numbers: those below the map's own are in it already, as
+        after a kill between the two files. A torn one at the end is cut off, so that new ones follow whole ones."""
         if not self._log.is_file():
             return
         whole = 0
@@ -95,25 +101,38 @@ class MapJournal:
                 )
             while record := _next_record(file):
                 whole = file.tell()
-                yield unpacked(record, str(self._log))
+                entry = unpacked(record, str(self._log))
+                if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], int)):
+                    raise OgPointcloudError(f"{self._log} is damaged: remove the folder and map again")
+                yield entry
         if whole < self._log.stat().st_size:
             os.truncate(self._log, whole)
 
-    def append(self, frame: Frame, known: GrowingMap) -> None:
-        """Write a frame behind the others; once the log is long, write the map that it led to and begin the log anew. A
-        kill between these two leaves frames that the map has already: their stamps are among its recent ones."""
-        frame = in_arrays(frame)
-        if frame.masks is not None and frame.masks.max(initial=0) < 1 << 15:
-            frame = replace(frame, masks=frame.masks.astype(np.int16))
+    def append(self, number: int, change: Frame | Poses) -> None:
+        """Write a change behind the others. Where that fails, as on a full disk, the log stays as it was."""
+        if isinstance(change, Frame):
+            change = in_arrays(change)
+            if change.masks is not None and change.masks.max(initial=0) < 1 << 15:
+                change = replace(change, masks=change.masks.astype(np.int16))
+        record = _record((number, change))
         with naming(self.folder):
-            self._file = self._file or self._log.open("ab")
-            self._file.write(_record(frame))
-            self._file.flush()
-            if self._file.tell() > LOG_BYTES:
+            self._file = self._file or self._log.open("ab", buffering=0)
+            whole = self._file.tell()
+            try:
+                if self._file.write(record) < len(record):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                self._file.truncate(whole)  # what is written later would lie behind a torn record, and be lost with it
+                raise
+
+    def settle(self, known: GrowingMap) -> None:
+        """Once the log is long, write the map that it led to, and begin the log anew."""
+        if self._file is not None and self._file.tell() > LOG_BYTES:
+            with naming(self.folder):
                 with replacing(self._state) as file:
                     file.write(_record((self._origin, known)))
                 self._file.close()
-                self._file = self._log.open("wb")
+                self._file = self._log.open("wb", buffering=0)
 
 
 def _record(value: Any) -> bytes:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.boxes import Box, axis_aligned_box
 from og_pointcloud.mapping.changes import Moved
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.likeness import ALIKE, Look, Scale
@@ -16,16 +17,16 @@ from og_pointcloud.mapping.tracks import NO_TRACK
 
 @dataclass(frozen=True)
 class MapObject:
-    """An object as it is known now. place: (3,) median of its points, world coordinates; size: (3,) along the axes.
-    state: "present"; "moved": present, but not where it was at first; "unseen": part of an earlier map, where no frame
-    has looked since; "gone": place and size are those it had last. since: the stamp from which on most of its points
-    have been seen there, -inf for those of an earlier map, inf for what left; last_seen: the stamp of the last frame
-    that showed it."""
+    """An object as it is known now. place: (3,) median of its points, world coordinates; box: around them, along the
+    world's axes. state: "present"; "moved": present, but not where it was at first; "unseen": part of an earlier map,
+    where no frame has looked since; "gone": place and box are those it had last. since: the stamp from which on most of
+    its points have been seen there, -inf for those of an earlier map, inf for what left; last_seen: the stamp of the
+    last frame that showed it."""
 
     id: int
     state: str
     place: NDArray[np.float64]
-    size: NDArray[np.float64]
+    box: Box
     points: int
     views: int
     since: float
@@ -39,9 +40,9 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
     for id_, k in sorted(known.tracks.by_id().items()):
         track, rows = known.tracks.tracks[k], known.rows_of(k)
         if track.left:
-            place, size, state = track.left.place, track.left.size, "gone"
+            place, bounds, state = track.left.place, track.left.bounds, "gone"
         elif len(rows):
-            size, place = np.ptp(known.points.xyz[rows].astype(np.float64), axis=0), known.place_of(rows)
+            place, bounds = known.place_of(rows), known.points.xyz[rows].astype(np.float64) + known.origin
             looked_at = known.presence.seen_at[rows].max() > -np.inf
             state = "moved" if track.moved else "present" if looked_at else "unseen"
         else:
@@ -49,8 +50,11 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
         # Half of its points have come by the median of the frames that brought them.
         since = known.stamp_of(int(np.median(known.kept.born[rows]))) if len(rows) else np.inf
         objects.append(
-            MapObject(id_, state, place, size, len(rows), track.views, since, track.last_seen, track.descriptor)
-        )
+            MapObject(
+                id_, state, place, axis_aligned_box(bounds), len(rows), track.views, since, track.last_seen,
+                track.descriptor,
+            )
+        )  # fmt: skip
     return objects
 
 
@@ -122,7 +126,7 @@ def _look(known: GrowingMap, k: int, rows: NDArray[np.integer]) -> Look:
     descriptor = np.zeros((0, 1)) if descriptor is None else descriptor[None]
     xyz, rgb = known.points.xyz[rows], known.points.rgb[rows]
     spread = float(known.tracks.spread()[k])
-    return Look.of_points(descriptor.astype(np.float32), spread, known.place_of(rows), xyz, rgb)
+    return Look.of_points(descriptor.astype(np.float32), spread, known.place_of(rows), xyz, known.origin, rgb)
 
 
 def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:

@@ -60,6 +60,8 @@ class MapRecord:
             raise OgPointcloudError(
                 f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
             ) from None
+        if not record.visits:
+            raise OgPointcloudError("the map's record has no visit; expected one or more: fit it again")
         # Ids are rows of the table: one beyond it would be found only where somebody asks for it.
         ids = {*record.last_seen, *record.moved_from, *record.gone}
         if ids and not 0 <= min(ids) <= max(ids) < count:
@@ -78,11 +80,10 @@ class MapRecord:
 
 
 def _look(entry: dict[str, Any], table: InstanceTable, instance: int) -> Look:
-    color, length = entry["color"], float(entry["length"])
-    return Look(
-        *descriptors_of(table, instance), np.array(_three(entry["place"])),
-        None if color is None else np.array(_three(color)), np.full(3, length), length,
-    )  # fmt: skip
+    color, length, place = entry["color"], float(entry["length"]), np.array(_three(entry["place"]))
+    bounds = place + length * np.array([[-0.5], [0.5]])
+    color = None if color is None else np.array(_three(color))
+    return Look(*descriptors_of(table, instance), place, color, bounds, length)
 
 
 def _three(values: Any) -> tuple[float, ...]:

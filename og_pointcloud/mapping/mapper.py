@@ -160,10 +160,10 @@ class Mapper:
     def _resumed(self, journal: MapJournal) -> MapJournal:
         """Go on from what a journal holds."""
         self._map = journal.state() or self._map
-        self._journal = None  # frames of the journal are not written to it again
-        for frame in journal.frames():
-            if self._map is None or frame.stamp not in self._map.recent:
-                self.integrate(frame)
+        self._journal = None  # changes of the journal are not written to it again
+        for number, change in journal.changes():
+            if self._map is None or number >= self._map.sequence:
+                self.correct(change) if isinstance(change, dict) else self.integrate(change)
         return journal
 
     @property
@@ -191,6 +191,8 @@ class Mapper:
         if given.view is not None:
             about = known.points.xyz[known.about(given.camera, most=COMPARED)]
             require_same_place(given.stamp, given.view, about, known.presence.tolerance)
+        if self._journal is not None:
+            self._journal.append(known.sequence, replace(frame, stamp=given.stamp))
         # From here on the map changes, and nothing is refused any more.
         self._map, known.stamp = known, max(known.stamp, given.stamp)
         rows, died, new, again = np.zeros(0, np.int32), np.zeros(0, np.int32), [], []
@@ -207,7 +209,7 @@ class Mapper:
             known.tracks.prune(known.votes, given.stamp)
         known.count(given.stamp)
         if self._journal is not None:
-            self._journal.append(replace(frame, stamp=given.stamp), known)
+            self._journal.settle(known)
         return FrameChange(new_ids, updated, tuple(gone), moved, time.perf_counter() - start)
 
     def objects(self) -> list[MapObject]:
@@ -253,8 +255,12 @@ class Mapper:
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
         if self._map is None:
             raise SceneError("no frame was integrated yet, so there is nothing to correct: integrate some first")
-        self._map.correct(poses)
+        number = self._map.sequence
+        corrected = self._map.correct(poses)
         self._around = None
+        if self._journal is not None:
+            self._journal.append(number, corrected)
+            self._journal.settle(self._map)
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
         """The frame, and the map that it goes into: an empty one where there is none yet."""
@@ -283,7 +289,7 @@ class Mapper:
         # Points that were given at the start in the order in which they were given, then those that frames brought.
         rows = np.concatenate([self._rows, np.arange(len(self._rows), known.points.n)])
         rows = rows[chosen[rows]]
-        if around is None or len(around.spacing) != len(rows):
+        if around is None or not np.array_equal(rows, self._rows):  # as many may be others
             around = neighbourhood(known.points.xyz[rows], self.settings.geometry)
         visit = labelled(known, rows, around, self.settings)
         if self._base is not None:

@@ -167,7 +167,7 @@ class Visit:
         cloud = self.cloud
         place = (cloud.xyz[rows].astype(np.float64) + cloud.origin).mean(axis=0)
         rgb = None if cloud.rgb is None else cloud.rgb[rows]
-        return Look.of_points(*descriptors_of(cloud.instances, instance), place, cloud.xyz[rows], rgb)
+        return Look.of_points(*descriptors_of(cloud.instances, instance), place, cloud.xyz[rows], cloud.origin, rgb)
 
     def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
         """(instances,) how many points of each instance are chosen. chosen: (n,) bool. sure: (n,) what a point counts;

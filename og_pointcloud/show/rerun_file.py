@@ -48,7 +48,8 @@ class RerunSink:
         if image is not None:
             self._recording.log("world/camera/image", rerun.Image(image).compress(jpeg_quality=JPEG_QUALITY))
         if masks is not None:
-            ids = np.asarray(masks + 1, np.uint16)  # 0, which the viewer leaves clear, is outside
+            # 0, which the viewer leaves clear, is outside, and what the lens did not see.
+            ids = np.asarray(np.maximum(masks, -1) + 1, np.uint16)
             self._recording.log("world/camera/masks", rerun.SegmentationImage(ids, opacity=0.5))
 
     def instances(self, step: int, scene: LabelledScene, appeared: NDArray[np.bool_]) -> None:

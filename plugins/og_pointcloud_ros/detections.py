@@ -80,8 +80,7 @@ def to_objects(
     """The objects of a map (`Mapper.objects`) as vision_msgs/Detection3DArray: the object's id, its box along the axes
     of the map's frame, and its state as class id: present, moved, unseen, or gone, then with its last box."""
     head = header(messages, frame_id, stamp)
-    boxes = ((entry, Box(entry.place, entry.size, np.eye(3))) for entry in objects)
-    detections = [_detection(entry.id, box, entry.state, 1.0, head, messages) for entry, box in boxes]
+    detections = [_detection(entry.id, entry.box, entry.state, 1.0, head, messages) for entry in objects]
     return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)
 
 
