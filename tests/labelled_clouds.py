@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import og_pointcloud as og
 from og_pointcloud.cloud import BACKGROUND, NO_EVIDENCE, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
 
 TOO_FAR = -3
 WIDTH = 16
 SPACE = "tiny-test-space"
 WORDS = ("apple", "pear", "plum", "café", "red ball")
+
+
+def quietly(*arguments: Any, **options: Any) -> og.Segmentation:
+    """`og.segment` without its warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return og.segment(*arguments, **options)
 
 
 def unit_rows(count: int, width: int = WIDTH, seed: int = 0) -> NDArray[np.float32]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import test_choosing
 from commands import run
-from labelled_clouds import SPACE, TOO_FAR, queries, room
+from labelled_clouds import SPACE, TOO_FAR, queries, quietly, room
 from og_pointcloud_export import write_bundle
 from test_choosing import Made, unit
 
@@ -56,12 +55,6 @@ def scene(path):
 def plain(cloud):
     """The same scene without its bank."""
     return og.LabelledScene.from_cloud(replace(cloud, word_bank=None))
-
-
-def quietly(*arguments, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return og.segment(*arguments, **options)
 
 
 def answers_plainly(scene, points, texts):

@@ -11,6 +11,7 @@ import shutil
 import numpy as np
 import onnx
 import pytest
+from commands import error_of
 from onnx import numpy_helper
 from onnxruntime.quantization import QuantType, quantize_dynamic
 from text_models import (
@@ -244,7 +245,8 @@ def test_the_image_command(model_folder, tmp_path, capsys):
     assert open_encoder(tmp_path / "out").crops == LANGSPLAT
     assert main(arguments) == 0
     assert open_encoder(tmp_path / "out").crops == WITH_CONTEXT
-    assert main(["export", "image", str(tmp_path / "none")]) == 2
+    capsys.readouterr()
+    assert "is no folder and no model" in error_of(capsys, "export", "image", tmp_path / "none")
 
 
 def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, monkeypatch):
@@ -254,8 +256,7 @@ def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, mo
     (model / "refs").mkdir()
     for main_is in ("", "../../..", "c" * 40):
         (model / "refs" / "main").write_text(main_is)
-        assert main(["export", "text", SPACE]) == 2
-        assert f"'{SPACE}' is no folder and no model that was fetched" in capsys.readouterr().err
+        assert f"'{SPACE}' is no folder and no model that was fetched" in error_of(capsys, "export", "text", SPACE)
     (model / "refs" / "main").write_text("b" * 40 + "\n")
     shutil.copytree(model_folder, model / "snapshots" / ("b" * 40))
     assert main(["export", "text", SPACE]) == 0

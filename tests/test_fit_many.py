@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import error_of
 from scenes import write_tiny_capture
 
 import og_pointcloud as og
@@ -235,9 +236,8 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}
     assert main(["fit", str(captures[0]), "--out", str(out)]) == 0
     assert "1 were there already" in capsys.readouterr().out
-    assert main(["fit", str(captures[0]), str(captures[1]), "-o", str(tmp_path / "x.ogpc")]) == 2
-    assert "expected --out DIR" in capsys.readouterr().err
-    assert main(["fit", str(captures[0]), "--out", str(out), "--work", str(tmp_path / "x.work")]) == 2
+    assert "expected --out DIR" in error_of(capsys, "fit", captures[0], captures[1], "-o", tmp_path / "x.ogpc")
+    assert "--work is for a single file" in error_of(capsys, "fit", captures[0], "--out", out, "--work", tmp_path / "w")
 
 
 @pytest.mark.slow

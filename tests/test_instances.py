@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import error_of
 from labelled_clouds import WIDTH, WORDS, instance_table, make_cloud, room, unit_rows
 
 import og_pointcloud as og
@@ -176,5 +177,5 @@ def test_command(bundle, tmp_path, capsys):
     assert len((tmp_path / "new" / "t.csv").read_text().splitlines()) == 10
     assert main(["instances", str(bundle), "--json", "--words", "1"]) == 0
     assert [len(record["words"]) for record in json.loads(capsys.readouterr().out)] == [1, 1, 1, 1, 0, 1, 1, 1, 1]
-    assert main(["instances", str(bundle), "-o", str(tmp_path / "t.txt")]) == 2
-    assert main(["instances", str(bundle), "--up", "0,0"]) == 2
+    assert "ends in .json or .csv" in error_of(capsys, "instances", bundle, "-o", tmp_path / "t.txt")
+    assert "expected 3 numbers" in error_of(capsys, "instances", bundle, "--up", "0,0")

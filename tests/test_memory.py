@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import error_of
 from conftest import TinyCapture
 from scipy.sparse import csr_array, random_array
 from test_fit import boxes_on_a_table
@@ -24,7 +25,6 @@ from test_membership import groups, on_a_line
 from test_visibility import NEAR, camera, cloud, view_of
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting import mask_table as mask_table_module
 from og_pointcloud.fitting import membership
@@ -512,7 +512,7 @@ def test_a_fit_killed_in_the_middle_goes_on_and_gives_the_same_bits(tiny_capture
 
 
 def test_memory_of_a_fit_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", str(tmp_path), "-o", str(tmp_path / "a.ogpc"), "--memory", "4"]) == 2
-    assert "expected a size of at least 64MB" in capsys.readouterr().err
+    said = error_of(capsys, "fit", tmp_path, "-o", tmp_path / "a.ogpc", "--memory", "4")
+    assert "expected a size of at least 64MB" in said
     with pytest.raises(OgPointcloudError, match="memory is 0; expected a whole number above 0"):
         FitSettings(memory=0)

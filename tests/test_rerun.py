@@ -9,9 +9,9 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from commands import error_of
 from labelled_clouds import make_cloud
 
-from og_pointcloud.cli import main
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
 
@@ -132,5 +132,4 @@ def test_without_rerun_the_extra_is_named_before_the_work(tmp_path, capsys, monk
     monkeypatch.setitem(sys.modules, "rerun", None)
     (tmp_path / "capture").mkdir()
     out = ["-o", str(tmp_path / "a.ogpc"), "--rerun", str(tmp_path / "a.rrd")]
-    assert main(["fit", str(tmp_path / "capture"), *out]) == 2
-    assert "og-pointcloud[rerun]" in capsys.readouterr().err
+    assert "og-pointcloud[rerun]" in error_of(capsys, "fit", tmp_path / "capture", *out)

@@ -20,6 +20,7 @@ from labelled_clouds import (
     make_cloud,
     nearest_plainly,
     queries,
+    quietly,
     reference_scores,
     room,
     tough_clouds,
@@ -44,12 +45,6 @@ def bundle_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scene(bundle_file):
     return og.load(bundle_file)
-
-
-def quietly(*arguments, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return og.segment(*arguments, **options)
 
 
 def labels_plainly(cloud, instances, words):
@@ -208,9 +203,7 @@ def test_a_graph_whose_tables_lie_gives_an_error_or_an_instance_of_the_scene(sce
         constant.raw_data = bytes([byte]) * len(constant.raw_data)
         lies = runtime.LabelledScene(replace(scene._bundle, query_onnx=graph.SerializeToString()))
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                result = og.segment(scene.xyz[:500], ["apple"], lies)
+            result = quietly(scene.xyz[:500], ["apple"], lies)
         except BundleError as error:
             assert "query.onnx" in str(error)  # noqa: PT017
         else:

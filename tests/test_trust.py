@@ -23,6 +23,7 @@ import benchmark_stream
 import numpy as np
 import pytest
 from capture_files import edit_poses
+from commands import error_of
 from copc_files import attributes_of
 from hostile_files import (
     UNBOUNDED_TOKENIZERS,
@@ -492,8 +493,7 @@ def test_no_home(monkeypatch, bundle, capsys):
     monkeypatch.setattr(Path, "home", fail)
     for name in ("HF_HOME", "HF_HUB_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    assert main(["segment", str(bundle), "--labels", "foo"]) == 2
-    assert "not among the 5 known words" in capsys.readouterr().err
+    assert "not among the 5 known words" in error_of(capsys, "segment", bundle, "--labels", "foo")
 
 
 def test_no_folder_for_compiled_code(monkeypatch):
@@ -564,8 +564,8 @@ def test_names_of_files_that_are_no_utf8(bundle, tmp_path, capsys):
     write_json(tmp_path / "s.json", {"file": str(scene)})
     assert json.loads((tmp_path / "s.json").read_text()) == {"file": str(scene)}
     capsys.readouterr()
-    assert main(["index", str(tmp_path), "-o", str(tmp_path / "atlas")]) == 2
-    assert "k\\udcfcche' holds bytes that are no UTF-8: rename the file or folder" in capsys.readouterr().err
+    said = error_of(capsys, "index", tmp_path, "-o", tmp_path / "atlas")
+    assert "k\\udcfcche' holds bytes that are no UTF-8: rename the file or folder" in said
 
 
 def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):
