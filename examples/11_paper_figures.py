@@ -19,7 +19,6 @@ from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, PaperSettings
 from og_pointcloud.show.drawing import as_splats, draw
@@ -64,7 +63,24 @@ views = [scene.views[index] for index in np.linspace(0, len(scene.views) - 1, 4)
 views.append(View("from above", camera, np.full((height, width), -1, np.int32), np.zeros((0, 1), np.float32)))
 # Points are drawn all alike: where strays lie far apart, the Gaussians of the method are as large as furniture.
 splats = as_splats(scene.points, default.spacing)
-og.feature_picture(Gaussians.from_points(splats), views, surface.near, stages, out / "features.png", columns=5)
+# The three principal directions of the features, three standard deviations wide each, become red, green and blue.
+known = features[shown]
+_, deviations, axes = np.linalg.svd(known - known.mean(axis=0), full_matrices=False)
+to_rgb = axes[:3].T / np.maximum(3 * deviations[:3] / np.sqrt(len(known)), 1e-12)
+small = [view.camera.resized(360, round(360 * height / width)) for view in views]
+photographs = [
+    np.full((height, width, 3), 255, np.uint8) if (image := view.image_rgb()) is None else image for view in views
+]
+rows = [
+    np.hstack([cv2.resize(image, (lens.width, lens.height)) for image, lens in zip(photographs, small, strict=True)])
+]
+for title, of_points in stages.items():
+    rgb = np.clip(255 * (0.5 + (of_points - known.mean(axis=0)) @ to_rgb), 0, 255)
+    rgb = np.where(np.isnan(rgb), 128, rgb)
+    drawn = (draw(splats, og.in_world(lens, scene.points.origin), rgb, near=surface.near) for lens in small)
+    rows.append(np.hstack([*drawn]))
+    cv2.putText(rows[-1], title, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+write_png(out / "features.png", np.vstack(rows))
 
 # A click on the middle of the word's thing, in the view that shows most of it and all that lies around it.
 best = og.select(default, {arguments.word: words.vectors[words.names.index(arguments.word)]}).best

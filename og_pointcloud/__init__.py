@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from og_pointcloud.scene import Camera
     from og_pointcloud.settings import FitSettings
     from og_pointcloud.show import edit as edit
-    from og_pointcloud.show.fit_pictures import feature_colors, feature_picture
     from og_pointcloud.text.text_features import read_text_features
 
 __version__ = "0.1.0"
@@ -68,7 +67,7 @@ __all__ = [
     "Collection", "FeatureSpaceError", "Finding", "Findings", "FitOptions", "FitSettings", "Frame", "Instance",
     "InstanceTable", "Instances", "LabelledCloud", "LabelledScene", "Mapper", "Match", "MissingExtraError", "Moved",
     "OgPointcloudError", "Pick", "Reason", "SceneError", "Segmentation", "Segmenter", "Selection", "Vocabulary",
-    "WordBank", "axis_aligned_box", "compare", "feature_colors", "feature_picture", "fit", "fit_many", "in_world",
+    "WordBank", "axis_aligned_box", "compare", "fit", "fit_many", "in_world",
     "instance_table", "load", "oriented_box", "pick", "read_bundle", "read_capture", "read_opengaussian", "read_points",
     "read_text_features", "segment", "select", "update", "write_bundle",
 ]  # fmt: skip
@@ -100,7 +99,6 @@ _HOMES = {
     "og_pointcloud.mapping.merging": ("update",),
     "og_pointcloud.scene": ("Camera",),
     "og_pointcloud.settings": ("FitSettings",),
-    "og_pointcloud.show.fit_pictures": ("feature_colors", "feature_picture"),
     "og_pointcloud.text.text_features": ("read_text_features",),
     "og_pointcloud_export": ("write_bundle",),
 }  # fmt: skip

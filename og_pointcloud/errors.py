@@ -76,7 +76,7 @@ class SceneError(OgPointcloudError):
     >>> og.axis_aligned_box([])
     Traceback (most recent call last):
         ...
-    og_pointcloud.errors.SceneError: points are of shape (0,); expected numbers (n, 3), at least one point, for a box
+    og_pointcloud.errors.SceneError: points are float64 of shape (0,); expected numbers (n, 3), at least one point, ...
     """
 
 

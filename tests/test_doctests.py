@@ -22,13 +22,11 @@ def example_of(name):
 
 @pytest.fixture(scope="module")
 def known():
-    """What other examples start from: the cloud that LabelledCloud's own makes, the scenes of fit's and
-    feature_picture's."""
+    """What other examples start from: the cloud that LabelledCloud's own makes, and the scene of fit's."""
     start = {}
     shared = {
         "LabelledCloud": ("cloud", "np", "og"),
         "fit": ("scene", "wall"),
-        "feature_picture": ("gaussians", "view", "pathlib", "tempfile"),
     }
     for source, names in shared.items():
         example = example_of(source)

@@ -96,9 +96,7 @@ for ask in (
 
 
 @pytest.mark.parametrize("module", ["scipy", "numba"])
-@pytest.mark.parametrize(
-    "name", ["fit", "Mapper", "compare", "update", "fit_many", "read_opengaussian", "feature_picture"]
-)
+@pytest.mark.parametrize("name", ["fit", "Mapper", "compare", "update", "fit_many", "read_opengaussian"])
 def test_what_makes_scenes_names_its_extra(module, name):
     code = f"""import sys
 sys.modules["{module}"] = None

@@ -47,7 +47,7 @@ def test_a_known_cloud_ends_as_a_fit_does():
     capture = scene(THINGS)
     fitted = og.fit(capture, og.FitSettings(mode="grouping"), progress=False)
     mapper, _ = mapped(without_depth(frames(THINGS)), cloud=capture.points)
-    cloud = mapper.finish().cloud
+    cloud = mapper.snapshot().cloud
     np.testing.assert_array_equal(cloud.xyz, fitted.xyz)
     same = [(fitted.instance_ids == instance_of(fitted, t)) == (cloud.instance_ids == instance_of(cloud, t))
             for t in THINGS]  # fmt: skip
@@ -84,7 +84,7 @@ def test_objects_have_the_ids_of_the_snapshot(grown):
 def test_the_order_of_frames_hardly_matters():
     given = frames(THINGS)
     shuffled = [given[k] for k in np.random.default_rng(0).permutation(len(given))]
-    one, other = (mapped(g, spacing=0.04)[0].finish().cloud for g in (given, shuffled))
+    one, other = (mapped(g, spacing=0.04)[0].snapshot().cloud for g in (given, shuffled))
     for thing in THINGS:
         sizes = [cloud.instances.points[instance_of(cloud, thing)] for cloud in (one, other)]
         assert min(sizes) > 0.7 * max(sizes)
@@ -97,7 +97,7 @@ def test_what_is_carried_elsewhere_keeps_its_id():
     changes = [mapper.integrate(frame) for frame in second]
     assert [k for change in changes for k in change.gone] == [crate]
     assert [entry.id for change in changes for entry in change.moved] == [crate]
-    cloud = mapper.finish().cloud
+    cloud = mapper.snapshot().cloud
     assert instance_of(cloud, ELSEWHERE) == crate
     assert instance_of(cloud, CRATE) == -1
 
@@ -121,14 +121,14 @@ def test_a_missed_detection_removes_nothing():
     mapper, _ = mapped(frames(THINGS))
     blind = [replace(frame, masks=None, features=None, stamp=50.0 + k) for k, frame in enumerate(frames(THINGS))]
     assert all(mapper.integrate(frame).gone == () for frame in blind)
-    assert {instance_of(mapper.finish().cloud, thing) for thing in THINGS}.isdisjoint({-1})
+    assert {instance_of(mapper.snapshot().cloud, thing) for thing in THINGS}.isdisjoint({-1})
 
 
 @pytest.mark.slow
 def test_a_map_is_gone_on_with():
     before = og.fit(scene(THINGS), progress=False)
     mapper, _ = mapped(frames([CHEST, ELSEWHERE, PARCEL], seed=1, first=10.0), before)
-    cloud = mapper.finish().cloud
+    cloud = mapper.snapshot().cloud
     changes = mapper.changes
     assert changes.gone == (instance_of(before, BIN),)
     assert [entry.id for entry in changes.moved] == [instance_of(before, CRATE)]
@@ -257,7 +257,7 @@ def test_sparse_depth_makes_a_map():
         replace(f, depth=np.where(random.random(f.depth.shape) < 0.05, f.depth, 0)) for f in frames(THINGS, cameras(40))
     ]
     mapper, _ = mapped(sparse, spacing=0.05)
-    cloud = mapper.finish().cloud
+    cloud = mapper.snapshot().cloud
     assert len({instance_of(cloud, thing) for thing in THINGS} - {-1}) == 3
 
 
@@ -491,7 +491,7 @@ def test_glass_that_gives_no_reading_stays():
     later = frames([*THINGS, PANE], seed=1, first=50.0)
     holes = [replace(f, depth=np.where(cast([*THINGS, PANE], f.camera)[1] == 3, 0, f.depth)) for f in later]
     assert all(mapper.integrate(frame).gone == () for frame in holes)
-    assert instance_of(mapper.finish().cloud, PANE) == pane
+    assert instance_of(mapper.snapshot().cloud, PANE) == pane
 
 
 def test_glass_that_is_looked_through_now_and_then_stays():
@@ -500,9 +500,9 @@ def test_glass_that_is_looked_through_now_and_then_stays():
         given[k] = through
     mapper, changes = mapped(given)
     assert all(change.gone == () for change in changes)
-    assert instance_of(mapper.finish().cloud, PANE) not in {
+    assert instance_of(mapper.snapshot().cloud, PANE) not in {
         -1,
-        *(instance_of(mapper.finish().cloud, t) for t in THINGS),
+        *(instance_of(mapper.snapshot().cloud, t) for t in THINGS),
     }
 
 
@@ -561,16 +561,16 @@ def test_objects_know_since_when_they_stand_where_they_are():
     mapper, _ = mapped(frames(THINGS))
     for frame in frames([*THINGS, PARCEL], seed=1, first=100.0):
         mapper.integrate(frame)
-    cloud, objects = mapper.finish().cloud, {entry.id: entry for entry in mapper.objects()}
+    cloud, objects = mapper.snapshot().cloud, {entry.id: entry for entry in mapper.objects()}
     assert all(objects[instance_of(cloud, thing)].since < 100 for thing in THINGS)
     assert objects[instance_of(cloud, PARCEL)].since >= 100
 
 
-def test_finish_draws_points_as_large_as_a_fit_does():
+def test_snapshots_draw_points_as_large_as_a_fit_does():
     capture, given = scene(THINGS), without_depth(frames(THINGS))
     cloud = og.fit(capture, progress=False)
     mapper, _ = mapped(given, cloud=capture.points)
-    mapper.finish()
+    mapper.snapshot()
     known, scale = mapper._map, cloud.provenance["notes"]["gaussian_scale"]
     geometry = og.FitSettings().geometry
     assert known.scale == scale != geometry.middle_scale

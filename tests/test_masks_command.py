@@ -420,8 +420,10 @@ def broken(image):
 def halves(image):
     left = np.arange(image.shape[1]) < image.shape[1] // 2
     return np.broadcast_to([[left], [~left]], (2, *image.shape[:2])).copy()
+class Broken:
+    def propose(self, image):
+        return 1 / 0
 class Nothing:
-    name = "nothing"
     def propose(self, image):
         from og_pointcloud.masking.contracts import Proposals
         return Proposals(np.zeros((0, *image.shape[:2]), bool), np.zeros(0, np.float32))
@@ -438,6 +440,9 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
     assert make_masks("c", settings, "halves", progress=False).masks == 4
     settings = MaskSettings(proposer="python:own_masks:Nothing", encoder=None)
     assert make_masks("c", settings, "nothing", progress=False).masks == 0
+    (tmp_path / "own_masks.py").write_text(OWN.replace("class Nothing:", "Nothing = halves\nclass Something:"))
+    assert make_masks("c", settings, "nothing", progress=False).masks == 4, "of code that has changed since"
+    (tmp_path / "own_masks.py").write_text(OWN)
     for place, says in {
         "own_masks:number": "'python:own_masks:number' is a int; expected a function",
         "own_masks:none": "no proposer 'python:own_masks:none'",
@@ -445,6 +450,7 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
         "own_masks": "expected python:MODULE:NAME",
         "own_masks:bright": "a mask proposer gave",
         "own_masks:broken": r"python:own_masks:broken failed \(ZeroDivisionError: division by zero\)",
+        "own_masks:Broken": r"python:own_masks:Broken failed \(ZeroDivisionError: division by zero\)",
         "typo:x": r"no proposer 'python:typo:x' \(SyntaxError",
     }.items():
         settings = MaskSettings(proposer=f"python:{place}", encoder=None)

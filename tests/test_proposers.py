@@ -105,7 +105,7 @@ def test_the_grid_finds_each_thing_once():
     _, ids = painted()
     image = np.repeat((ids * 60).astype(np.uint8)[:, :, None], 3, axis=2)
     oracle = Oracle()
-    proposals = AutomaticMasks(oracle, "oracle", points_per_side=8, batch=7).propose(image)
+    proposals = AutomaticMasks(oracle, points_per_side=8, batch=7).propose(image)
     assert oracle.prompts == 64
     assert len(proposals) == 4
     for thing in range(4):
@@ -260,8 +260,8 @@ def test_a_colour_png_is_refused(tmp_path):
 def test_any_callable():
     image, ids = painted()
     masks = ids == np.arange(1, 4)[:, None, None]
-    for answer in (masks, ids, ids - 1, from_ids(ids)):
-        proposals = CallableProposer(lambda _, answer=answer: answer).propose(image)
+    for answer in (masks, ids, ids - 1, from_ids(ids), ids.astype(np.uint8), ids.astype(np.uint64)):
+        proposals = CallableProposer(lambda _, answer=answer: answer, "mine").propose(image)
         assert np.array_equal(proposals.masks, masks)
     scored = Proposals(masks, np.array([0.2, 0.3, 0.4], np.float32))
     assert as_proposals(scored, (120, 160)) is scored

@@ -3,8 +3,8 @@
 A frame is checked, then compared with the map: which points it measures again, which it sees through, which it cannot
 see. Its depth adds points; its masks vote (`tracks`); what it shows is kept as rows of the mask table (`kept_views`),
 and the frame itself is let go. Points seen through from two places leave, and an object leaves with most of its visible
-points. All of this touches only what the frame sees. `snapshot` and `finish` then label every point by the batch rule
-from the rows kept.
+points. All of this touches only what the frame sees. `snapshot` then labels every point by the batch rule from the rows
+kept.
 """
 
 from __future__ import annotations
@@ -228,8 +228,6 @@ class Mapper:
         if self._labelled is None or self._labelled[0] != known.sequence:
             self._labelled = known.sequence, LabelledScene.from_cloud(self._label(known))
         return self._labelled[1]
-
-    finish = snapshot
 
     @property
     def changes(self) -> Changes | None:

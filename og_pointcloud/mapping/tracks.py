@@ -8,7 +8,7 @@ those beside, as views do in `fitting.membership`; a frame that missed the track
 
 Each frame is a witness for every two tracks that masks show in it: that they are one thing, if most of both lies in one
 mask, else that they are two. Tracks are joined when a majority of their witnesses says one (`fitting.grouping` does the
-same for masks, over all views at once; `Mapper.finish` runs that rule). A frame touches only the tracks that it sees.
+same for masks, over all views at once; `Mapper.snapshot` runs that rule). A frame touches only the tracks that it sees.
 """
 
 from __future__ import annotations

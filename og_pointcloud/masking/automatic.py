@@ -44,7 +44,6 @@ class AutomaticMasks:
     """
 
     predictor: PointPredictor
-    name: str
     points_per_side: int = 32
     batch: int = 64
     least_iou: float = 0.88

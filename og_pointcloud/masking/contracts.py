@@ -46,12 +46,7 @@ class Proposals:
 
 
 class MaskProposer(Protocol):
-    """Where things are in an image. ``name`` says which one it was, for the record that lies with the masks."""
-
-    @property
-    def name(self) -> str:
-        """Which proposer it is."""
-        ...
+    """Where things are in an image."""
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB. No thing found is a Proposals of length 0, not an error."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import runpy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     if isinstance(given, Proposals):
         return given
     if masks.ndim == 2 and masks.dtype.kind in "iu":
-        return from_ids(np.maximum(masks, -1), none=-1 if masks.min(initial=0) < 0 else 0)
+        return from_ids(np.maximum(masks.astype(np.int64), -1), none=-1 if masks.min(initial=0) < 0 else 0)
     if masks.ndim == 3 and masks.dtype == np.bool_:
         return Proposals(masks, np.ones(len(masks), np.float32))
     raise SceneError(
@@ -57,10 +57,11 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
 
 @dataclass(frozen=True)
 class CallableProposer:
-    """A function of the user's, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer."""
+    """A function of the user's, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer. name: of the
+    function, for errors."""
 
     function: Callable[[NDArray[np.uint8]], Any]
-    name: str = "callable"
+    name: str
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """SceneError where the function fails, or gives something else."""
@@ -75,8 +76,8 @@ class CallableProposer:
 
 
 def own_proposer(place: str) -> MaskProposer:
-    """The proposer ``MODULE:NAME``: a function as `CallableProposer` takes it, a proposer, or a class of proposers,
-    which is called without arguments. SceneError where it is not there.
+    """The proposer ``MODULE:NAME``: a function as `CallableProposer` takes it, an object whose ``propose`` is one, or a
+    class of such, which is called without arguments. SceneError where it is not there.
 
     MODULE is the file ``MODULE.py`` in the working directory (dots are folders), else a module that Python finds. The
     import path stays as it is: a file that imports its neighbors needs their folder in PYTHONPATH.
@@ -85,7 +86,7 @@ def own_proposer(place: str) -> MaskProposer:
     if not name or not all(part.isidentifier() for part in module.split(".")):
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
-        file = Path(*module.split(".")).with_suffix(".py")
+        file = own_file(place)
         # A file is run by its path, not imported: one called numpy.py does not take numpy's place.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
     except Exception as error:  # whatever running the module may raise
@@ -94,13 +95,14 @@ def own_proposer(place: str) -> MaskProposer:
             "installed module"
         ) from error
     made = found() if isinstance(found, type) else found
-    if hasattr(made, "propose") and hasattr(made, "name"):
-        return made
-    if callable(made):
-        return CallableProposer(made, f"python:{place}")
-    raise SceneError(
-        f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose and name"
-    )
+    if callable(function := getattr(made, "propose", made)):
+        return CallableProposer(function, f"python:{place}")
+    raise SceneError(f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose")
+
+
+def own_file(place: str) -> Path:
+    """Where the file of ``MODULE:NAME`` would be."""
+    return Path(f"{place.partition(':')[0].replace('.', '/')}.py")
 
 
 def _of_user(error: Exception) -> str:
@@ -117,7 +119,6 @@ class ExistingMasks:
 
     folder: Path
     tracks: bool = False
-    name: str = field(default="existing", init=False)
 
     def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""

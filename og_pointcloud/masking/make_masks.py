@@ -31,6 +31,7 @@ from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
+from og_pointcloud.masking.existing import own_file
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
@@ -119,10 +120,12 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """A name for settings, and for the masks of a folder that they name: work files of others are not taken up."""
+    """A name for settings, and for the masks or the code of the user's that they name: work files of others are not
+    taken up."""
     of_image = replace(settings, every=1)  # which images are used does not change what one of them gives
-    masks = [_state(file) for file in sorted(settings.folder.rglob("*"))] if settings.folder else []
-    return _digest([VERSION, asdict(of_image), masks])
+    kind, _, place = settings.proposer.partition(":")
+    given = sorted(settings.folder.rglob("*")) if settings.folder else [own_file(place)] if kind == "python" else []
+    return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
 
 def _work_name(photograph: Photograph) -> str:

@@ -13,7 +13,7 @@ All lengths are shares of the image's; distances are in 8-bit CIE Lab. Nothing i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,21 +57,14 @@ MOST = 250
 """At most so many proposals of an image, the best by score."""
 
 
-@dataclass(frozen=True)
 class OpenCVProposer:
-    """The embedded proposer: OpenCV's contrib modules, no weights.
-
-    working_side: the image is shrunk to this many pixels along its longer side first.
-    """
-
-    working_side: int = WORKING_SIDE
-    name: str = field(default="opencv", init=False)
+    """The embedded proposer: OpenCV's contrib modules, no weights."""
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB."""
         cv2 = require_cv2()
         height, width = image.shape[:2]
-        scale = min(1.0, self.working_side / max(height, width))
+        scale = min(1.0, WORKING_SIDE / max(height, width))
         size = round(width * scale), round(height * scale)
         if min(size) < FEWEST_PIXELS:
             return Proposals(np.zeros((0, height, width), np.bool_), np.zeros(0, np.float32))

@@ -50,7 +50,7 @@ class Preparation:
 
 def open_sam(name: str | os.PathLike[str]) -> AutomaticMasks:
     """A proposer from a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
-    return AutomaticMasks(SamPredictor(name), f"sam:{name}")
+    return AutomaticMasks(SamPredictor(name))
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,6 @@ class NamedThings:
         """name: as for `sam.open_sam`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
         self._loaded = load_sam(name, {"sam3": "Sam3Model", "sam3_video": "Sam3Model"})
         self._tokens = _tokens(self._loaded, words)
-        self.name = f"sam:{name}"
 
     @torch.inference_mode()
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
@@ -58,7 +57,7 @@ class FollowedWords:
         """As `NamedThings`, with a SAM 3 that has its tracker. images_before: how many images earlier runs have done,
         so that tracks of this run have other numbers than theirs."""
         self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})
-        self.name, self._first = f"sam:{name}", images_before * TRACKS_OF_A_RUN
+        self._first = images_before * TRACKS_OF_A_RUN
         # The value that transformers sets when fetching has failed: else it would fetch code and run it.
         sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
         device, self._step = self._loaded.device, 0
