@@ -59,7 +59,7 @@ def _brief(value: Any) -> str:
     return "<read when asked for>" if callable(value) else repr(value)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera without distortion.
 
@@ -158,7 +158,7 @@ class CutMasks:
     rows: NDArray[np.int64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One posed image with its masks.
 
@@ -245,7 +245,7 @@ class View:
         return image
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Points:
     """A plain cloud, or Gaussians when scale, rotation and opacity are known (all three or none).
 

@@ -34,7 +34,8 @@ def image_message(make, array, encoding, stamp):
 def messages_of(make, frame):
     """By role, what a camera and a mask proposer send of a frame."""
     camera, stamp = frame.camera, stamp_of(frame)
-    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
+    # ROS counts pixel centers at whole numbers.
+    k = np.array([camera.fx, 0, camera.cx - 0.5, 0, camera.fy, camera.cy - 0.5, 0, 0, 1], np.float64)
     window = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     rows = np.zeros(len(frame.features), [("feature", "<f4", (frame.features.shape[1],))])
     rows["feature"] = frame.features

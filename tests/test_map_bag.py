@@ -12,9 +12,9 @@ pytest.importorskip("rosbags")
 from commands import run
 from frame_messages import messages_of, place_of, stamp_of
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
-from og_pointcloud_ros.frames import image_array
+from og_pointcloud_ros.frames import FrameAssembler, image_array
 from og_pointcloud_ros.map_bags import BagFrames
-from og_pointcloud_ros.messages import header
+from og_pointcloud_ros.messages import header, plain_messages
 from rosbags.rosbag2 import Writer
 from visits import BIN, CHEST, CRATE, SPACE, frames, instance_of
 
@@ -27,7 +27,7 @@ TOPICS = {"info": "/camera_info", "depth": "/depth/image_rect", "color": "/color
 KINDS = {"features": "sensor_msgs/msg/PointCloud2", "info": "sensor_msgs/msg/CameraInfo"}
 
 
-def write_bag(folder, given, without=()):
+def write_bag(folder, given, without=(), messages=messages_of):
     store = ros2_types()
     make = rosbags_messages(store)
     with Writer(folder, version=8) as bag:
@@ -41,10 +41,10 @@ def write_bag(folder, given, without=()):
             where = make("geometry_msgs/msg/TransformStamped", header=header(make, "map", stamp),
                          child_frame_id="camera", transform=make("geometry_msgs/msg/Transform", translation=place,
                                                                  rotation=turn))  # fmt: skip
-            messages = {"/tf": make("tf2_msgs/msg/TFMessage", transforms=[where])}
-            messages |= {TOPICS[role]: message for role, message in messages_of(make, frame).items()}
+            sent = {"/tf": make("tf2_msgs/msg/TFMessage", transforms=[where])}
+            sent |= {TOPICS[role]: message for role, message in messages(make, frame).items()}
             for topic in out:
-                bag.write(out[topic], stamp, store.serialize_cdr(messages[topic], kinds[topic]))
+                bag.write(out[topic], stamp, store.serialize_cdr(sent[topic], kinds[topic]))
     return folder
 
 
@@ -92,10 +92,31 @@ def test_frames_of_a_bag_are_those_that_were_recorded(tmp_path):
     given[3] = replace(given[3], masks=np.full_like(given[3].masks, -1), features=given[3].features[:0])
     for frame, read in zip(given, BagFrames(write_bag(tmp_path / "drive", given)), strict=True):
         np.testing.assert_allclose(read.camera.world_to_camera, frame.camera.world_to_camera, atol=1e-6)
+        assert read.camera.intrinsics == frame.camera.intrinsics
         np.testing.assert_allclose(read.depth, frame.depth, atol=6e-4)
         np.testing.assert_array_equal(read.masks, frame.masks)
         np.testing.assert_array_equal(read.rgb, frame.rgb)
         np.testing.assert_array_equal(read.features, frame.features)
+
+
+def beside_a_raw_image(make, frame):
+    """The messages of a frame whose images image_proc rectified: P is their lens, K and D are that of the raw ones."""
+    messages = messages_of(make, frame)
+    info = messages["info"]
+    info.p[:] = np.c_[info.k.reshape(3, 3), np.zeros(3)].ravel()
+    info.k[:], info.d[:] = 1.1 * info.k, 0.1
+    return messages
+
+
+def test_rectified_images_have_the_lens_of_p(tmp_path, monkeypatch):
+    (frame,) = frames(THINGS)[:1]
+    (read,) = BagFrames(write_bag(tmp_path / "drive", [frame], messages=beside_a_raw_image))
+    assert read.camera.intrinsics == frame.camera.intrinsics
+    raw = FrameAssembler()
+    for role, message in beside_a_raw_image(plain_messages, frame).items():
+        raw.add(role, message)
+    with pytest.raises(SceneError, match="has distortion; expected rectified images"):
+        raw.frame(stamp_of(frame), lambda frame_id, stamp: np.eye(4))
 
 
 @pytest.mark.parametrize("topic", ["/depth/image_rect", "/masks", "/camera_info"])

@@ -157,6 +157,20 @@ def test_lists_over_their_budget_leave_boxes_open_and_every_answer_right(monkeyp
     assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_a_graph_has_no_more_bytes_than_a_file_can_and_stays_right(monkeypatch, share):
+    cloud = CLOUDS["room"]
+    points = queries(cloud, 300)
+    most = int(share * len(build_query_graph(cloud, build_lookup_grid(cloud))))
+    monkeypatch.setattr(lookup_grid, "MOST_BYTES", most)
+    monkeypatch.setattr(lookup_grid, "BOXES_PER_CHUNK", 1)
+    without_tables = 25_000
+    assert len(build_query_graph(cloud, build_lookup_grid(cloud))) < most + without_tables
+    found = run(cloud, points, texts(cloud))
+    assert 0 < found["certain"].mean() < 1
+    assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
+
+
 def test_boxes_answered_in_small_chunks_give_the_same_graph(monkeypatch):
     cloud = CLOUDS["room"]
     graph = build_query_graph(cloud, build_lookup_grid(cloud))

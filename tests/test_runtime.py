@@ -111,6 +111,15 @@ def test_many_points_are_asked_in_runs(scene, monkeypatch):
     assert (scene.instances_at(points) == whole).all()
 
 
+def test_answers_are_told_apart_and_kept_in_sets(scene):
+    """By identity: arrays have no one truth value."""
+    for make in (lambda: og.segment(scene), lambda: og.pick(scene, scene.xyz[0]), lambda: og.Frame(None, np.eye(3))):
+        one, other = make(), make()
+        assert one != other
+        assert {one, other} == {other, one}
+        assert [other, one].index(one) == 1
+
+
 def test_a_scene_offers_its_parts(scene, bundle_file):
     cloud = room()
     assert scene.xyz.dtype == np.float64

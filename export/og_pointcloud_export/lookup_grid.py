@@ -50,6 +50,8 @@ BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # time
 NODES_PER_POINT, NODES_AT_LEAST = 1, 1 << 13
 LISTS_PER_POINT, LISTS_AT_LEAST = 4, 1 << 16
 """Most blocks, nodes and lists: they bound the table whatever the scene's extent; the rest is for the exact search."""
+MOST_BYTES = 1_800_000_000
+"""Of all tables together, of which a graph holds less than 2^31 bytes: reached by clouds of 30 million points or so."""
 BRICKS_PER_AXIS = 1 << 13
 """So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
 BOXES_PER_CHUNK = 256
@@ -226,6 +228,13 @@ class _Table:
             split_low.append(boxes.split_low)
         return np.concatenate(split_low)
 
+    @property
+    def _bytes(self) -> int:
+        """What the tables take at most: 4 bytes a value and an entry of a list, 16 a point that is in a list, 5 a
+        child."""
+        in_lists = min(self._candidates_made, len(self._points[-1]))
+        return 4 * (CHILDREN * self._rows_promised + self._candidates_made) + 16 * in_lists + 5 * self._children_made
+
     def _answer(self, low: NDArray[np.float64], size: float, longest: int, *, last: bool) -> Iterator[_Boxes]:
         """Answer boxes, chunk after chunk, and add their children; what is over the budget is left open."""
         for first in range(0, len(low), BOXES_PER_CHUNK):
@@ -234,6 +243,8 @@ class _Table:
             lists = np.empty((*child.shape, LONGEST_LIST), np.int32)
             level = (size, self._rounding, longest, last)
             answer_children(corners, level, self._limits, self._points, (answers, child, lengths, lists))
+            if self._bytes > MOST_BYTES:
+                self._nodes_allowed = self._lists_allowed = 0
             if self._lists_made >= self._lists_allowed:  # no more lists: what would have one is open
                 child[child != SPLIT], lengths[:] = NOTHING, 0
             split = child == SPLIT

@@ -44,7 +44,7 @@ _NOTHING_PICKED = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pick:
     """What a click hit.
 

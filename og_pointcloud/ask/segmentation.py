@@ -26,7 +26,7 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """Endings of the files that a result is written to."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """One row a point, in the order of the points asked about.
 
@@ -56,7 +56,7 @@ class Segmentation:
     scene: Path | None = None
     calibrated: bool = False
     certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
-        default=lambda points: None, repr=False, compare=False
+        default=lambda points: None, repr=False
     )
 
     def __len__(self) -> int:

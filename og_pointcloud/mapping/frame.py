@@ -33,7 +33,7 @@ UNIT_SPREAD = 1.2
 """In another unit all depths are off by one factor: three quarters of the ratios span less than this times it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One posed image of a stream. Everything but the camera may be missing.
 

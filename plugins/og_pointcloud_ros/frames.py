@@ -2,7 +2,7 @@
 
 Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 16UC1 or 32SC1: 0 none, else a number from 1 on
 that means something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask, the encoder's
-features of masks 1, 2, ... CameraInfo is of rectified images.
+features of masks 1, 2, ... CameraInfo counts pixel centers at whole numbers.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import lengths
+from og_pointcloud.formats.poses import Sensor
 from og_pointcloud.mapping.frame import Frame
 from og_pointcloud.scene import Camera
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
@@ -56,11 +57,12 @@ class _Parts:
 
 
 class FrameAssembler:
-    """Puts messages together by their stamps. whole: roles that a frame waits for. waiting: by stamp, in nanoseconds,
-    in the order in which they came."""
+    """Puts messages together by their stamps. whole: roles that a frame waits for. rectified: whether images are, as
+    image_proc makes them: the camera_info beside them still tells the lens of the raw ones. waiting: by stamp, in
+    nanoseconds, in the order in which they came."""
 
-    def __init__(self, whole: Iterable[str] = WHOLE) -> None:
-        self.whole, self.waiting = tuple(whole), dict[int, _Parts]()
+    def __init__(self, whole: Iterable[str] = WHOLE, *, rectified: bool = False) -> None:
+        self.whole, self.rectified, self.waiting = tuple(whole), rectified, dict[int, _Parts]()
         self._info: Any = None
 
     def add(self, role: str, message: Any) -> None:
@@ -100,7 +102,7 @@ class FrameAssembler:
             return None
         if self._info is None:
             raise SceneError("no camera_info came with it")
-        camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
+        camera = _camera(self._info, self.rectified, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
         depth = None if parts.depth is None else lengths(parts.depth)
         # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
         masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
@@ -112,8 +114,13 @@ class FrameAssembler:
         self.waiting.pop(stamp, None)
 
 
-def _camera(info: Any, world_to_camera: NDArray[np.float64]) -> Camera:
-    if np.any(np.abs(np.asarray(info.d, np.float64)) > 1e-9):
-        raise SceneError("camera_info has distortion; expected rectified images: record image_rect topics")
-    k = np.asarray(info.k, np.float64)  # 3 x 3, row by row: fx 0 cx, 0 fy cy, 0 0 1
-    return Camera(int(info.width), int(info.height), k[0], k[4], k[2], k[5], world_to_camera)
+def _camera(info: Any, rectified: bool, world_to_camera: NDArray[np.float64]) -> Camera:
+    if not rectified and np.any(np.abs(np.asarray(info.d, np.float64)) > 1e-9):
+        raise SceneError(
+            "camera_info has distortion; expected rectified images: give image_rect topics (of a bag, with 'rect' in "
+            "their names; of the node, with rectified:=true)"
+        )
+    # K, 3 x 3, is the lens of the raw images, P, 3 x 4, that of the rectified ones (sensor_msgs/CameraInfo).
+    k, p = np.reshape(info.k, (3, 3)), np.reshape(info.p, (3, 4))
+    sensor = Sensor.from_matrix((int(info.width), int(info.height)), p if rectified and p[0, 0] > 0 else k)
+    return Camera(*sensor.size, sensor.fx, sensor.fy, sensor.cx, sensor.cy, world_to_camera)

@@ -1,7 +1,8 @@
 """Frames of a map from a ROS 2 bag, without ROS: depth and color images, masks with features, poses from tf.
 
 Topics are known by type and name: an Image with "depth" in its topic's name is depth, one with "mask" is masks, any
-other is color; a PointCloud2 with "feature" brings features (`frames`). Messages of one stamp are one frame.
+other is color; a PointCloud2 with "feature" brings features (`frames`). Images are rectified where depth or masks have
+"rect" in their topic's name. Messages of one stamp are one frame.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class BagFrames:
             self._roles = _roles([(c.topic, c.msgtype) for c in reader.connections], str(source))
 
     def __iter__(self) -> Iterator[Frame]:
-        store, assembler = ros2_types(), FrameAssembler(role for role in WHOLE if role in self._roles.values())
+        whole = [role for role in WHOLE if role in self._roles.values()]
+        rectified = any("rect" in topic.lower() for topic, role in self._roles.items() if role in ("depth", "masks"))
+        store, assembler = ros2_types(), FrameAssembler(whole, rectified=rectified)
         with open_bag(self.source) as reader:
             tree = transforms_of(reader, store)
             for connection, _, data in messages_of(reader, [c for c in reader.connections if c.topic in self._roles]):

@@ -33,7 +33,7 @@ from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.messages import ros_messages, time_message
 from og_pointcloud_ros.node import PlacedNode, error_text, latest_only, run
 
-PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "max_age": 2.0}
+PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "rectified": False, "max_age": 2.0}
 """With their defaults; config/map.yaml explains them."""
 INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
 QUEUED = 10
@@ -45,7 +45,7 @@ class MapNode(PlacedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("og_pointcloud_map", PARAMETERS, **options)
-        self._assembler, self._arrived = FrameAssembler(), dict[int, float]()
+        self._assembler, self._arrived = FrameAssembler(rectified=self._value("rectified")), dict[int, float]()
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._objects = self.create_publisher(Detection3DArray, "~/objects", latest_only(reliable, latched=True))
         self._queue = FrameQueue(self._empty(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
