@@ -4,7 +4,7 @@
     python examples/benchmark_maps.py frames CAPTURE --shuffle --pose-noise 0.01 0.2 --depth-share 0.05
     python examples/benchmark_maps.py frames CAPTURE --every 4 --tenths 1     # a quarter of the frames, the end alone
     python examples/benchmark_maps.py speed CAPTURE               # ms a frame at 100,000 and 1,000,000 points
-    python examples/benchmark_maps.py loops CAPTURE               # memory over two loops of the same path
+    python examples/benchmark_maps.py loops CAPTURE --depth-noise 0.002   # memory over loops of the same path
     python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
     python examples/benchmark_maps.py pairs FOLDER... --sparse 5000   # the same as structure from motion has them
     python examples/benchmark_maps.py days SEED...                # demo rooms: a map that goes on growing the next day
@@ -38,7 +38,7 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.sight import depth_views
 from og_pointcloud.scene import Camera, Points, Scene
 
-TENTHS, WARM_UP = 10, 5
+TENTHS, WARM_UP, LOOPS = 10, 5, 4
 SIZES = 100_000, 1_000_000
 TEXTURED, FALLS_OFF_M = 60, 0.35
 """Places of a room that structure from motion finds, and the distance from them at which it finds a third as much."""
@@ -56,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--shuffle", action="store_true", help="frames in random order")
     parser.add_argument("--pose-noise", type=float, nargs=2, default=(0, 0), metavar=("M", "DEG"))
     parser.add_argument("--depth-share", type=float, default=1.0, metavar="X", help="of the readings that are kept")
+    parser.add_argument("--depth-noise", type=float, default=0.0, metavar="X", help="of loops: times depth squared")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take each N-th frame")
     parser.add_argument("--tenths", type=int, default=TENTHS, metavar="N", help="rows of the table")
     parser.add_argument("--no-fit", action="store_true", help="without the fits of the same frames")
@@ -187,12 +188,15 @@ def speed(folder: Path, options: argparse.Namespace) -> None:
 
 
 def loops(folder: Path, options: argparse.Namespace) -> None:
-    """Memory after each of two loops of the same path."""
+    """Memory after each of LOOPS loops of the same path, each with noise of its own in the depth."""
     capture, frames = frames_of(folder, options)
-    mapper = mapper_of(capture, frames)
-    for loop in range(2):
+    mapper, random = mapper_of(capture, frames), np.random.default_rng(0)
+    for loop in range(LOOPS):
         for frame in frames:
-            mapper.integrate(replace(frame, stamp=frame.stamp + loop * len(frames)))  # pyright: ignore
+            depth = frame.depth
+            if depth is not None and options.depth_noise:
+                depth = (depth + random.normal(size=depth.shape) * options.depth_noise * depth**2).astype(np.float32)
+            mapper.integrate(replace(frame, depth=depth, stamp=frame.stamp + loop * len(frames)))  # pyright: ignore
         print(f"{folder.name} loop {loop + 1}: {mapper.points:,} points, {mapper.nbytes / 1e6:.1f} MB kept of frames")
 
 
