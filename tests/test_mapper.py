@@ -316,6 +316,15 @@ def test_voxel_points_are_means_of_their_voxels():
     np.testing.assert_allclose(found[few], means[few], atol=1e-5)
 
 
+def test_what_stands_where_others_left_moves_with_its_own_frame():
+    points, place = VoxelPoints(0.25, grows=True), np.full((1, 3), 0.1, np.float32)
+    assert points.add(place, np.zeros((1, 3), np.uint8), 0)
+    assert not points.add(place, np.zeros((1, 3), np.uint8), 1)
+    points.weight[0] = 0  # it left
+    assert points.add(place + np.float32(0.1), np.zeros((1, 3), np.uint8), 2)
+    assert (points.n, points.anchor.tolist(), points.xyz[0].tolist()) == (1, [2], pytest.approx([0.2] * 3))
+
+
 KILLED = """
 import sys, time
 sys.path.insert(0, {tests!r})

@@ -407,6 +407,15 @@ def test_another_encoder_is_refused(monday):
         og.update(monday, "capture", progress=False)
 
 
+def test_a_map_without_points_is_refused(monday):
+    none = replace(monday, xyz=monday.xyz[:0], instance_ids=monday.instance_ids[:0], rgb=None, certainty=None)
+    for pair in ((none, monday), (monday, none)):
+        with pytest.raises(SceneError, match="0 points; expected at least one"):
+            og.compare(*pair)
+    with pytest.raises(SceneError, match="0 points; expected at least one"):
+        og.Mapper(none)
+
+
 def test_a_damaged_record_is_refused(monday):
     with pytest.raises(OgPointcloudError, match="record of its visits is damaged"):
         MapRecord.of(replace(monday, provenance={"map": {"visits": 3}}))

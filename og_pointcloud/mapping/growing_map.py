@@ -119,13 +119,12 @@ class GrowingMap:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
             row, column = pixel // camera.width, pixel % camera.width
             rgb = frame.rgb[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
-        points.add(xyz.astype(np.float32), rgb, len(self.anchors))
-        added = np.arange(before, points.n, dtype=np.int32)
-        if len(added):
+        if points.add(xyz.astype(np.float32), rgb, len(self.anchors)):
             self.anchors.append((frame.stamp, frame.camera.world_to_camera))
-            self.grow()
-            self.presence.odds[added], self.presence.seen_at[added] = 1, frame.stamp
-            self.kept.born[added] = self.sequence
+        added = np.arange(before, points.n, dtype=np.int32)
+        self.grow()
+        self.presence.odds[added], self.presence.seen_at[added] = 1, frame.stamp
+        self.kept.born[added] = self.sequence
         return added
 
     def owners(self) -> NDArray[np.int32]:

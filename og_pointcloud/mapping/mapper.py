@@ -117,6 +117,8 @@ class Mapper:
 
     def _know(self, points: Points, space: FeatureSpace, spacing: float | None, *, grows: bool) -> GrowingMap:
         """Begin with points that are known. spacing None: their own."""
+        if not len(points):
+            raise SceneError("the map has 0 points; expected at least one: begin an empty one, without start and cloud")
         require_finite(points.xyz)
         self._around = neighbourhood(points.xyz, self.settings.geometry)
         spacing = float(np.median(self._around.spacing)) if spacing is None else spacing

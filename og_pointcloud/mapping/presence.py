@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
+from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.likeness import Look, descriptors_of
@@ -137,7 +138,9 @@ class Visit:
 
     @cached_property
     def around(self) -> Neighbourhood:
-        """Neighbours of its points."""
+        """Neighbours of its points. SceneError where it has none."""
+        if not len(self.cloud):
+            raise SceneError("a visit has 0 points; expected at least one: it shows nothing to compare")
         return neighbourhood(self.cloud.xyz, GeometrySettings())
 
     def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:

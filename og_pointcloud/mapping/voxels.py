@@ -165,14 +165,14 @@ class VoxelPoints(Columns):
         self.refile()
         return np.argsort(order) + rows.start
 
-    def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> None:
-        """Take in measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new
-        ones."""
-        if self.grows:
-            self._reserve(len(xyz))
-            voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
-            self.n = _insert(xyz, rgb, anchor, self.edge, voxels, points, self.n)
-            self.packets.file(self.xyz)
+    def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> bool:
+        """Take in measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new ones.
+        Returns whether it brought any: new ones, or what stands now where others had left."""
+        self._reserve(len(xyz))
+        voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
+        self.n, brought = _insert(xyz, rgb, anchor, self.edge, voxels, points, self.n)
+        self.packets.file(self.xyz)
+        return brought
 
     def refile(self) -> None:
         """Find all points by their places again, after they were moved."""
@@ -246,23 +246,26 @@ def _index(new_keys, new_rows, keys, rows):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
-    """The number of points after the new ones are in. All readings of a point lie in its voxel, and so does their mean:
-    its key stays what it is."""
+    """The number of points after the new ones are in, and whether any is of this frame. All readings of a point lie in
+    its voxel, and so does their mean: its key stays what it is."""
     (keys, rows), (xyz, rgb, weight, anchor) = voxels, points
+    brought = False
     for i in range(len(new)):
         key = _key(new[i, 0], new[i, 1], new[i, 2], edge)
         slot = _slot(key, keys)
         if keys[slot] == EMPTY:
             keys[slot], rows[slot] = key, n
             xyz[n], rgb[n], weight[n], anchor[n] = new[i], color[i], 1, frame
-            n += 1
+            n, brought = n + 1, True
             continue
         # A running mean; with the weight bounded it becomes a moving one. Weight 1 is a point that had left (0 before):
         # it begins anew at the reading.
         row = rows[slot]
         weight[row] = min(weight[row] + 1, MOST_WEIGHT)
+        if weight[row] == 1:
+            anchor[row], brought = frame, True
         for a in range(3):
-            if anchor[row] >= 0 or weight[row] == 1:  # points that were known from the start stay where they are
+            if anchor[row] >= 0:  # points that were known from the start stay where they are
                 xyz[row, a] += (new[i, a] - xyz[row, a]) / weight[row]
             rgb[row, a] += (color[i, a] - rgb[row, a]) / weight[row]
-    return n
+    return n, brought
