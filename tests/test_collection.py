@@ -183,6 +183,11 @@ def test_box_and_scenes_restrict(folder):
     assert not collection.find("lamp", within=([500, 0, 0], [501, 1, 1]))
     with pytest.raises(OgPointcloudError, match="no scene is called 'room9'"):
         collection.find("lamp", scenes="room9")
+    for top in (0, 2.5, "3"):
+        with pytest.raises(OgPointcloudError, match=r"top is .*; expected a whole number, at least 1"):
+            collection.find("lamp", top=top)
+    with pytest.raises(OgPointcloudError, match="expected at least one word"):
+        collection.find(5)
     with pytest.raises(OgPointcloudError, match="no scene is named"):
         collection.find("lamp", scenes=[])
     with pytest.raises(OgPointcloudError, match="the low one first"):

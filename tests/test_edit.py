@@ -99,7 +99,7 @@ def test_every_way_to_say_what(scene, splats, tmp_path):
         np.testing.assert_array_equal(vertices(done.path), rows[np.isin(scene.instance_ids, ids)])
 
 
-@pytest.mark.parametrize("what", [-1, 9, [], [0, 44], [0.0], True, [True]])
+@pytest.mark.parametrize("what", [-1, 9, [], [0, 44], [0.0], True, [True], 3.0, None])
 def test_what_is_no_instance_is_refused(scene, splats, tmp_path, what):
     with pytest.raises(OgPointcloudError, match="ids from 0 to 8"):
         og.edit.remove(scene, what, tmp_path / "out.ply", cloud=splats)
@@ -146,8 +146,9 @@ def test_halo_takes_unlabelled_points_near_the_object_alone(scene, splats, tmp_p
     expected = (ids == 8) | (near & (ids < 0))
     assert (ids == 8).sum() < expected.sum() < ((ids == 8) | near).sum()
     np.testing.assert_allclose(stacked(vertices(done.path), "xyz"), xyz[expected], atol=1e-4)
-    with pytest.raises(OgPointcloudError, match="halo is -1"):
-        og.edit.extract(scene, 8, tmp_path / "x.ply", halo=-1)
+    for halo in (-1, np.nan, "1"):
+        with pytest.raises(OgPointcloudError, match=f"halo is {halo}"):
+            og.edit.extract(scene, 8, tmp_path / "x.ply", halo=halo)
 
 
 def test_nothing_and_everything_are_refused(scene, tmp_path):

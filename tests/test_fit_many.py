@@ -196,6 +196,18 @@ def test_a_pool_that_breaks_costs_only_what_it_had_left(captures, tmp_path):
     assert "its worker died (BrokenProcessPool" in fits[1].cause
 
 
+@pytest.mark.slow
+def test_a_script_without_a_guard_is_told_and_does_not_run_once_more_in_each_process(captures, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import og_pointcloud as og\nfits = og.fit_many([{str(captures[0])!r}], {str(tmp_path / 'out')!r})\n"
+        "print('all done', fits[0].state)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100)
+    assert "all work of a script, below if __name__ == '__main__':" in done.stderr
+    assert done.stdout == "all done failed\n"
+
+
 def test_processes_end_with_the_one_that_started_them():
     """Also where it had no time to say so."""
     code = (

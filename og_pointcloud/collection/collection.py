@@ -8,6 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -161,9 +162,9 @@ class Collection:
         scenes: names, or patterns such as "site3/*". top: how many.
         Raises OgPointcloudError where no scene can be asked, or a name or pattern fits none.
         """
-        if top < 1:
-            raise OgPointcloudError(f"top is {top}; expected at least 1")
-        names = tuple(dict.fromkeys((words,) if isinstance(words, str) else words))
+        if not isinstance(top, Integral) or top < 1:
+            raise OgPointcloudError(f"top is {top!r:.40}; expected a whole number, at least 1")
+        names = tuple(dict.fromkeys(words if isinstance(words, Iterable) and not isinstance(words, str) else (words,)))
         if not names or not all(isinstance(name, str) and name.strip() for name in names):
             raise OgPointcloudError(f"the words are {names!r:.80}; expected at least one word or phrase")
         features = read_text_features(text_features) if isinstance(text_features, (str, os.PathLike)) else text_features

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,11 +91,17 @@ def fit_many(
     Files that are there and whole are left as they are; fits that were killed resume after the views that they kept.
     Returns what became of each, in the order given; nothing is raised for a capture that fails. The files do not depend
     on where and in what order they were made: they hold no times, which are in the returned records.
-    OgPointcloudError, before any work, for two captures of one name.
+    OgPointcloudError, before any work, for two captures of one name, and in a script that calls it at its top level
+    without an executor: its processes import the script, which would run once more in each.
 
     >>> og.fit_many([], "out")
     ()
     """
+    if executor is None and getattr(current_process(), "_inheriting", False):  # as Python's own guard asks
+        raise OgPointcloudError(
+            "fit_many is called while one of its own processes imports this script; expected it, and all work of a "
+            "script, below if __name__ == '__main__':"
+        )
     options, out = options or FitOptions(), Path(out).resolve()
     jobs = _outputs([Path(capture).resolve() for capture in captures], out)
     fits = {

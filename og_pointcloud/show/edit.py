@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
@@ -171,7 +172,7 @@ def _subject(
     halo: float = 0.0, text_features: TextFeatures = None,
 ) -> _Cloud:  # fmt: skip
     """Reads the cloud and finds the points that are meant."""
-    if not (np.isfinite(halo) and halo >= 0):
+    if not (isinstance(halo, Real) and 0 <= halo < np.inf):
         raise OgPointcloudError(f"halo is {halo}; expected a number of spacings, at least 0")
     scene = as_scene(scene)
     _check_output(output, [path for path in (cloud, scene.path) if path is not None])
@@ -201,7 +202,7 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
         )
     what = what.instances if isinstance(what, Selection) else what
     what = what.instance if isinstance(what, (Pick, Match)) else what
-    ids = (what,) if isinstance(what, (int, np.integer)) else tuple(what)
+    ids = tuple(what) if isinstance(what, Iterable) else (what,)
     wrong = [k for k in ids if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < count]
     if wrong or not ids:
         raise OgPointcloudError(
