@@ -79,7 +79,8 @@ def rendered(weights: list[csr_array], ids: list[NDArray[np.int32]], mask_counts
 @pytest.fixture
 def tiny(tiny_capture: TinyCapture) -> Rendered:
     scene = read_capture(tiny_capture.folder)
-    gaussians = prepare(scene).surface.gaussians
+    surface = prepare(scene).surface
+    gaussians = surface.gaussians.take(surface.row_of_point)  # in the order of the capture's truth
     table = mask_table(gaussians, scene.views, 0.05)
     weights = [pixel_weights(gaussians, view.camera, 0.05) for view in scene.views]
     ids = [view.mask_map().ravel() for view in scene.views]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from og_pointcloud.rendering import geometry
 from og_pointcloud.rendering.geometry import (
     TAMED_BY,
+    along_curve,
     chance_of_place,
     near_plane,
     nearest_in,
@@ -98,6 +99,21 @@ def test_only_duplicates() -> None:
     around = neighbourhood(np.ones((50, 3), np.float32), SETTINGS)
     np.testing.assert_array_equal(around.spacing, 1)
     assert around.adjoining.all()
+
+
+@pytest.mark.parametrize("outlier", [0.5, 1e6])
+def test_what_follows_each_other_along_the_curve_is_near(random: Generator, outlier: float) -> None:
+    xyz = np.concatenate([random.uniform(size=(4096, 3)), [[outlier] * 3]]).astype(np.float32)
+    rows = along_curve(xyz)
+    np.testing.assert_array_equal(np.sort(rows), np.arange(4097))
+    runs = xyz[rows[rows != 4096]].reshape(64, 64, 3)  # of the cube of side 1, cubes of side 1/4 if all were even
+    assert np.median(np.ptp(runs, axis=1).max(axis=1)) < 0.5
+    assert np.median(np.ptp(xyz[:4096].reshape(64, 64, 3), axis=1).max(axis=1)) > 0.9
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_points_of_one_place_keep_their_order_along_the_curve(n: int) -> None:
+    np.testing.assert_array_equal(along_curve(np.ones((n, 3), np.float32)), np.arange(n))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, 18])

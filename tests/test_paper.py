@@ -51,7 +51,8 @@ class Balls:
 @pytest.fixture
 def balls(tiny_capture: TinyCapture) -> Balls:
     scene = read_capture(tiny_capture.folder)
-    return Balls(prepare(scene).surface.gaussians, scene.views, tiny_capture.object_ids)
+    surface = prepare(scene).surface
+    return Balls(surface.gaussians.take(surface.row_of_point), scene.views, tiny_capture.object_ids)
 
 
 def train_features(gaussians: Gaussians, views: Sequence[View], settings: PaperSettings, run: Any = None) -> Any:

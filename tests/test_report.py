@@ -203,8 +203,8 @@ def test_direct_uplift_is_the_weighted_mean_word_by_word(subject, prepared):
 
 def test_center_sampling_reads_the_pixel_of_each_centre(subject, prepared):
     scene, table, words = subject.scene, prepared.table, subject.vocabulary.vectors
-    labels = BASELINES["center sampling"](prepared, words)
-    exposure, similarity = table.exposure.toarray(), table.unit_features @ words.T
+    labels = prepared.surface.of_points(BASELINES["center sampling"](prepared, words))
+    exposure, similarity = prepared.surface.of_points(table.exposure.toarray().T).T, table.unit_features @ words.T
     first = np.searchsorted(table.mask_view, np.arange(len(scene.views)))
     maps = [view.mask_map() for view in scene.views]
     for point in range(0, len(scene.points), 11):

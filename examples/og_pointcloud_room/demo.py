@@ -16,10 +16,9 @@ from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary, WordBank
-from og_pointcloud.evaluate.baselines import uplift
+from og_pointcloud.evaluate.baselines import direct_uplift
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
-from og_pointcloud.fitting.fit import fit_prepared, prepare
-from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FitSettings
 from og_pointcloud_room.capture import ABSENT_WORDS, CaptureSettings, RoomCapture, make_capture, write_capture
@@ -96,7 +95,7 @@ def run_demo(
     with stage("ask absent words", seconds):
         called = _absent_called(loaded, capture)
     with stage("baselines", seconds):
-        plain, best = _baselines(prepared.table, seconds["render the masks"], capture)
+        plain, best = _baselines(prepared, seconds["render the masks"], capture)
     ours_seconds = sum(seconds[name] for name in ("render the masks", "fit", "write one file", "segment by words"))
     ours = MethodScore("og_pointcloud", _score(result.labels, capture), called, ours_seconds)
     methods, seen = (plain, ours, best), None
@@ -144,12 +143,12 @@ def _absent_called(scene: og.LabelledScene, capture: RoomCapture) -> float:
         return float((og.segment(capture.xyz, absent, scene=scene).labels >= 0).mean())
 
 
-def _baselines(table: MaskTable, render_s: float, capture: RoomCapture) -> tuple[MethodScore, MethodScore]:
+def _baselines(prepared: Prepared, render_s: float, capture: RoomCapture) -> tuple[MethodScore, MethodScore]:
     """Direct uplift on the mask table that the fit works on, and the ceiling on the truth."""
     features = np.concatenate(capture.mask_features)
 
     def plain(texts: NDArray[np.floating]) -> NDArray[np.integer]:
-        return uplift(table.weights, table.unit_features, texts)
+        return prepared.surface.of_points(direct_uplift(prepared, texts))
 
     def best(texts: NDArray[np.floating]) -> NDArray[np.integer]:
         return ceiling(features, capture.mask_instance, texts, capture.instance)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians
+from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians, ascending
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
@@ -30,6 +30,10 @@ CELLS = 1 << 13
 wider than float32 rounds that another unit of length moves few points into another cell."""
 FARTHEST = 1 << 17
 """Halves of the cloud's width within which there are cells: as many as 32 bits can number."""
+CURVE_BITS = 10
+"""Of a cell's number along an axis, of three in 32 bits, on the curve that points are ordered along."""
+CURVE_REACH = 4
+"""Halves of the cloud's width to either side that the curve runs through; what lies beyond is at its border."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,8 @@ def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.floa
     order of the points nor on their unit of length."""
     if not len(xyz):
         return np.zeros(0, np.float32)
-    # In cells of the cloud's own size; of its medians, lest a far outlier makes all else one cell.
-    place = xyz - np.median(xyz, axis=0)
-    size = np.median(np.abs(place), axis=0).max() or np.abs(place).max() or 1.0
-    near = np.clip(place, -FARTHEST * size, FARTHEST * size) / size  # beyond, all is one place
-    cell = np.rint(CELLS * near).astype(np.int32).view(np.uint32)
+    # Cells of the cloud's own size; beyond the farthest, all is one place.
+    cell = np.rint(CELLS * _in_halves(xyz, FARTHEST)).astype(np.int32).view(np.uint32)
     # Their numbers, mixed by odd constants (those of xxHash).
     value = cell[:, 0] * np.uint32(0x9E3779B1) ^ cell[:, 1] * np.uint32(0x85EBCA77) ^ cell[:, 2] * np.uint32(0xC2B2AE3D)
     value ^= np.uint32(zlib.crc32(name.encode()))
@@ -108,6 +109,31 @@ def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.floa
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
     return (((value ^ (value >> np.uint32(16))) >> np.uint32(8)) * 2.0**-24).astype(np.float32)
+
+
+def along_curve(xyz: NDArray[np.float32]) -> NDArray[np.int32]:
+    """(n,) rows of points along Morton's curve through space: what is near in space is then mostly near in memory. So
+    runs of points lie beside an image as one, and what a view or a mask shows is read from few places.
+
+    >>> along_curve(np.array([[5, 5], [0, 0], [5, 4], [0, 1]], np.float32) @ np.eye(2, 3, dtype=np.float32))
+    array([1, 3, 2, 0], dtype=int32)
+    """
+    if not len(xyz):
+        return np.zeros(0, np.int32)
+    cells = 1 << CURVE_BITS
+    cell = ((_in_halves(xyz, CURVE_REACH) / CURVE_REACH + 1) / 2 * (cells - 1)).astype(np.uint32)
+    # Two zeros after each bit: halves of the number are moved apart, then halves of these.
+    for shift, kept in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        cell = (cell | cell << np.uint32(shift)) & np.uint32(kept)
+    return ascending(cell[:, 0] | cell[:, 1] << np.uint32(1) | cell[:, 2] << np.uint32(2))
+
+
+def _in_halves(xyz: NDArray[np.float32], farthest: float) -> NDArray[np.float32]:
+    """(n, 3) places from the cloud's middle in halves of its width, cut at ``farthest``. Both are medians, lest a far
+    outlier makes all else one place."""
+    place = xyz - np.median(xyz, axis=0)
+    size = np.median(np.abs(place), axis=0).max() or np.abs(place).max() or 1.0
+    return np.clip(place, -farthest * size, farthest * size) / size
 
 
 def sample_of_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
