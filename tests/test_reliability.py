@@ -19,7 +19,7 @@ from og_pointcloud.fitting.labellers import grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.reliability import SAME_LOOK, _cut, likely_cause, split_half
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import NOT_SEEN, Scene
+from og_pointcloud.scene import NOT_SEEN, Points, Scene
 from og_pointcloud.settings import FitSettings
 
 SETTINGS = FitSettings(mode="grouping")
@@ -171,6 +171,21 @@ def test_three_views_judge_nothing(scene: Scene) -> None:
     cloud = og.fit(replace(scene, views=scene.views[:3]), SETTINGS, progress=False)
     assert cloud.reliability is None
     assert np.isnan(cloud.instances.reliability).all()
+
+
+def test_one_thing_alone_beside_a_point_that_no_view_sees(scene: Scene) -> None:
+    """Unobserved is state -2, which a table of one row has no room for."""
+    first = scene.views[0].mask_features[0]
+
+    def with_one_mask(index, view):
+        of_thing = view.mask_map() == (view.mask_features @ first).argmax()
+        return replace(view, masks=np.where(of_thing, view.mask_map(), -1))
+
+    xyz = np.concatenate([scene.points.xyz, [[0, 0, -50]]]).astype(np.float32)
+    one = replace(with_views(scene, with_one_mask), points=Points(xyz, scene.points.origin))
+    cloud = og.fit(one, SETTINGS, progress=False)
+    assert (len(cloud.instances), cloud.instance_ids[-1]) == (1, og.UNOBSERVED)
+    assert cloud.reliability > 0.85
 
 
 def test_masks_without_features_leave_it_unknown(scene: Scene) -> None:

@@ -274,6 +274,13 @@ def test_the_page_of_changes_calls_nothing_unknown_that_is_as_it_was(visits_of_a
     assert (data["unlabelled"], data["unknown"]) == ("as it was, or not seen again", still.sum())
 
 
+def test_a_page_of_one_thing_beside_a_point_that_no_view_sees(tmp_path):
+    one = make_cloud(np.eye(3), [0, 0, og.UNOBSERVED])
+    nothing = make_cloud(np.eye(3), [-1, -1, -1])
+    write_changes_page(tmp_path / "c.html", nothing, one, og.Changes((), (0,), (), ()), np.array([0.0, 0, 1]))
+    assert "1 new" in (tmp_path / "c.html").read_text()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["serve", "page"])
 def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, window, kind):

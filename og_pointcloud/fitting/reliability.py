@@ -127,7 +127,7 @@ class _Looks:
         """Whether pairs of instances are of one look; none is like -1."""
         # A cosine for each different pair: points are many, pairs of instances few.
         pairs, place = np.unique(np.stack([first, second]), axis=1, return_inverse=True)
-        cosine = (self.direction[pairs[0]] * self.direction[pairs[1]]).sum(axis=1)
+        cosine = self.direction[np.maximum(pairs, 0)].prod(axis=0).sum(axis=1)
         same = ((pairs[0] == pairs[1]) | (cosine > SAME_LOOK)) & (pairs >= 0).all(axis=0)
         return same[place.ravel()]
 

@@ -60,7 +60,7 @@ def write_changes_page(
     both, change = both_visits(before, after, changes)
     scene = LabelledScene.from_cloud(both)
     # The page shows changes as if they were labels; what is as it was has none.
-    labels = np.where(both.instance_ids >= 0, change[both.instance_ids], len(STATES)).astype(np.int32)
+    labels = np.append(change, [-1, -1])[both.instance_ids].astype(np.int32)  # states -2 and -1 index the last two
     labels[labels >= len(STATES)] = -1
     reasons = np.where(labels < 0, Reason.NONE_FITS, Reason.LABELLED).astype(np.int8)
     result = Segmentation(
