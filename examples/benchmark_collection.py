@@ -208,7 +208,7 @@ def right_scenes(captures: list[Path], fitted: Path) -> None:
 def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncoder) -> None:
     """Scenes on a square kilometre, each of ten metres."""
     with Atlas.writing(path) as atlas:
-        atlas.set_root(path.parent)
+        atlas.note("root", str(path.parent.resolve()))
         words = atlas.add_words(encoder.words.names, encoder.words.vectors)
         for number, (table, boxes) in enumerate(made_scenes(descriptors, instances, encoder)):
             width = table.descriptors.shape[1]

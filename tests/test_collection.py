@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 import sqlite3
+import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.collection.index import index
+from og_pointcloud.collection.lance import write_lance
 from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.show.findings_page import picture, png_bytes
@@ -356,11 +359,11 @@ def test_of_two_who_make_an_atlas_at_a_time_neither_removes_it(tmp_path, monkeyp
     path, journal = tmp_path / "atlas", tmp_path / "atlas-journal"
     journal.write_bytes(bytes(600))  # of an atlas that was removed
     with Atlas.writing(path) as first:
-        first.set_root(tmp_path / "a")
+        first.note("root", str(tmp_path / "a"))
         with Atlas.writing(path) as second:
-            second.set_root(tmp_path / "b")
+            second.note("root", str(tmp_path / "b"))
         with pytest.raises(ZeroDivisionError), Atlas.writing(path) as third:
-            third.set_root(tmp_path / str(1 // 0))
+            third.note("root", str(tmp_path / str(1 // 0)))
         with Atlas.reading(path) as atlas:
             assert atlas.root == tmp_path / "b"
     with Atlas.reading(path) as atlas:
@@ -430,6 +433,25 @@ def test_pictures_show_the_thing(tmp_path):
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png_bytes(image), np.uint8), 1)[..., ::-1], image)
 
 
+def test_what_lance_has_of_an_atlas_that_changed_since_is_refused(folder, tmp_path, monkeypatch):
+    indexed(folder, many(3))
+    atlas, uri = folder.parent / "atlas", tmp_path / "lance"
+    uri.mkdir()
+    database = MagicMock()
+    database.create_table.return_value.count_rows.return_value = 0
+    monkeypatch.setattr("og_pointcloud.collection.lance._database", lambda uri: database)
+    monkeypatch.setitem(sys.modules, "pyarrow", MagicMock())
+    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+        og.Collection(atlas, lance=str(uri))
+    write_lance(atlas, str(uri))
+    monkeypatch.chdir(tmp_path)
+    collection = og.Collection(atlas, lance="lance")
+    og.write_bundle(scene(["bed"], 99), folder / "new.ogpc")
+    index(folder, atlas, progress=False)
+    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+        collection.find("bed")
+
+
 @pytest.mark.slow
 def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, monkeypatch):
     pytest.importorskip("lancedb", reason="needs the extra 'lance': lancedb")
@@ -457,5 +479,5 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
         og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")
     assert not (tmp_path / "other").exists()
     (tmp_path / "other").mkdir()
-    with pytest.raises(OgPointcloudError, match="has no table for these scenes"):
-        og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")
+    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+        og.Collection(atlas, lance=str(tmp_path / "other"))

@@ -424,6 +424,25 @@ def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path
     assert (again.last_stamp, again.points) == (third.stamp, mapper.points)
 
 
+def test_a_frame_that_failed_fails_again_and_the_map_goes_on(tmp_path, monkeypatch):
+    module, given = sys.modules["og_pointcloud.mapping.mapper"], frames(THINGS)[:3]
+    vote = module.vote
+
+    def failing(frame, *rest):
+        return vote(frame, *rest) if frame.stamp != given[1].stamp else 1 // 0
+
+    monkeypatch.setattr(module, "vote", failing)
+    mapper = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    mapper.integrate(given[0])
+    with pytest.raises(ZeroDivisionError):
+        mapper.integrate(given[1])
+    mapper.integrate(given[2])
+    with pytest.warns(UserWarning, match=r"change 2 of the journal fails \(ZeroDivisionError"):
+        again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    np.testing.assert_array_equal(again._map.points.xyz, mapper._map.points.xyz)
+    np.testing.assert_array_equal(again._map.votes.weight, mapper._map.votes.weight)
+
+
 def test_points_that_came_are_labelled_by_their_own_neighbours(monkeypatch):
     """As many came as were not seen: the neighbourhood of the map that was gone on with is not that of these."""
     base, _ = mapped(frames(THINGS)[:6])

@@ -153,9 +153,14 @@ def test_selecting_nothing_says_what_is_closest(scene):
         assert pv.PolyData(scene.xyz + 50).og.select("plum", scene).n_points == 0
 
 
-def test_boxes_are_the_instances_own(scene):
+def test_boxes_are_the_instances_own(scene, monkeypatch):
     mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
-    lines = mesh.og.boxes(scene, up=(0, 0, 1))
+    table, tables = og.instance_table, []
+    with monkeypatch.context() as patch:
+        patch.setattr(og, "instance_table", lambda *given, **options: tables.append(0) or table(*given, **options))
+        lines = mesh.og.boxes(scene, up=(0, 0, 1))
+    assert len(tables) == 1, "a table for each box makes them wait for minutes"
+    assert pv.PolyData().og.boxes(scene).n_cells == 0
     labelled = np.unique(mesh["og_instance"][mesh["og_label"] >= 0])
     assert np.array_equal(np.unique(lines["og_instance"]), labelled)
     assert lines.n_cells == 12 * len(labelled)

@@ -112,6 +112,8 @@ class Collection:
         if stamp and stamp == self._stamp:
             return
         with Atlas.reading(self.path) as atlas:
+            if self._lance is not None:
+                self._lance.require(atlas)
             self.root, self.entries = atlas.root, atlas.entries()
             self._groups = [group for family in families(atlas, self.entries) for group in family.groups()]
         self._by_name = {entry.name: entry for entry in self.entries}

@@ -64,7 +64,7 @@ def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progr
         raise OgPointcloudError(f"'{root}' holds no .ogpc file; expected a folder with what og-pointcloud fit wrote")
     added, replaced, left_out = [], [], []
     with Atlas.writing(path) as atlas:
-        atlas.set_root(root)
+        atlas.note("root", str(root.resolve()))
         known = {entry.name: entry for entry in atlas.entries()}
         others = [name for name, file in files.items() if name not in known or not _is_same(file, known[name])]
         for name in with_bar(others, "index", len(others), progress):

@@ -45,6 +45,7 @@ def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
 
     database = _database(uri)
     with Atlas.reading(atlas) as opened:
+        written = opened.fingerprint
         for group in (group for family in families(opened, opened.entries()) for group in family.groups()):
             numbers = {"scene": pa.int64(), "instance": pa.int32()} | dict.fromkeys("xyz", pa.float64())
             vector = pa.list_(pa.float16(), group.family.width + 1)
@@ -57,6 +58,13 @@ def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
             if (count := table.count_rows()) >= INDEXED_FROM:
                 partitions = max(8, count // ROWS_A_PARTITION)
                 table.create_index(metric="dot", index_type="IVF_SQ", num_partitions=partitions)
+    with Atlas.writing(atlas) as opened:
+        opened.note(_name(uri), written)
+
+
+def _name(uri: str) -> str:
+    """Under which an atlas notes what of it is there."""
+    return f"lance {uri if '://' in uri else os.path.abspath(uri)}"
 
 
 def _columns(block: Block) -> list[Any]:
@@ -76,6 +84,14 @@ class LanceTables:
         if "://" not in uri and not os.path.isdir(uri):
             raise OgPointcloudError(f"'{uri}' is no folder; expected what og-pointcloud index --lance wrote")
         self._uri, self._database = uri, _database(uri)
+
+    def require(self, atlas: Atlas) -> None:
+        """OgPointcloudError where these are not all scenes of an atlas, as they are now: new ones would be missed."""
+        if atlas.noted(_name(self._uri)) != atlas.fingerprint:
+            raise OgPointcloudError(
+                f"'{self._uri}' was not written from {atlas.path} as it is now: write it again with "
+                "og-pointcloud index --lance"
+            )
 
     def propose(
         self,

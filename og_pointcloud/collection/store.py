@@ -152,8 +152,18 @@ class Atlas:
     @property
     def root(self) -> Path:
         """The folder that was indexed."""
-        row = self._run("SELECT value FROM about WHERE name = 'root'").fetchone()
-        return Path(str(row[0])) if row else Path()
+        return Path(self.noted("root"))
+
+    def noted(self, name: str) -> str:
+        """What `note` wrote under a name, "" where it wrote nothing."""
+        row = self._run("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
+        return str(row[0]) if row else ""
+
+    @property
+    def fingerprint(self) -> str:
+        """Another one whenever scenes, their contents or their judges are others."""
+        query = "SELECT id, digest, judge FROM scenes LEFT JOIN judgements ON scene = id ORDER BY id"
+        return blake2b(repr(self._run(query).fetchall()).encode(), digest_size=16).hexdigest()
 
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
@@ -223,9 +233,9 @@ class Atlas:
 
     # What changes -------------------------------------------------------------------------------------------------
 
-    def set_root(self, root: Path) -> None:
-        """Note the folder that is indexed."""
-        self._run("INSERT OR REPLACE INTO about VALUES ('root', ?)", (str(root.resolve()),))
+    def note(self, name: str, value: str) -> None:
+        """Remember a text: under "root", the folder that is indexed."""
+        self._run("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, value))
 
     def add(self, entry: SceneEntry, table: InstanceTable, boxes: NDArray[np.float64]) -> None:
         """A scene, in place of one of the same name. Its id is given here, its judgement later. boxes: (K, 2, 3)."""

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
 from og_pointcloud.mapping.frame import COMPARED, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points, measured_points, vote
@@ -164,8 +164,14 @@ class Mapper:
         self._map = journal.state() or self._map
         self._journal = None  # changes of the journal are not written to it again
         for number, change in journal.changes():
-            if self._map is None or number >= self._map.sequence:
+            if self._map is not None and number < self._map.sequence:
+                continue
+            try:
                 self.correct(change) if isinstance(change, dict) else self.integrate(change)
+            except OgPointcloudError:
+                raise
+            except Exception as error:  # it failed when it came first, too: a map in a queue went on then
+                warnings.warn(f"change {number} of the journal fails ({type(error).__name__}: {error})", stacklevel=4)
         return journal
 
     @property

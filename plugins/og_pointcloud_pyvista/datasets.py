@@ -94,11 +94,14 @@ class OgDataSet:
         """
         found = find_scene(self._mesh, scene)
         mesh = self._with_instances(found)
+        if not mesh.n_points:
+            return pv.PolyData()
         segmented = LABEL in mesh.point_data
         wanted = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
         ids = [instance for instance in np.unique(mesh.point_data[INSTANCE][wanted]).tolist() if instance >= 0]
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
-        return box_lines([og.instance_table(found, up=up)[instance] for instance in ids], colors)
+        table = og.instance_table(found, up=up)
+        return box_lines([table[instance] for instance in ids], colors)
 
     def _with_instances(self, scene: LabelledScene) -> Any:
         """This dataset, or, where it has no instance ids, a shallow copy with the scene's."""
