@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Integral
@@ -158,13 +158,7 @@ class Instances(Sequence[Instance]):
 
     def to_records(self) -> list[dict[str, Any]]:
         """A JSON-able dictionary a row (`Instance.to_dict`)."""
-        asked = [row for row in self if row.points and "oriented_box" not in vars(row)]
-        for up in {id(row._up): row._up for row in asked}.values():
-            rows = [row for row in asked if row._up is up]
-            boxes = oriented_boxes([row.xyz[row.main_part] for row in rows], up)  # all at once takes half the time
-            for row, box in zip(rows, boxes, strict=True):
-                vars(row)["oriented_box"] = box
-        return [row.to_dict() for row in self]
+        return [row.to_dict() for row in with_boxes(self)]
 
     def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
         """The records as JSON text; also written to path, whole or not at all, where one is given."""
@@ -190,6 +184,18 @@ class Instances(Sequence[Instance]):
         if len(self) > len(shown):
             lines.append(f"and {len(self) - len(shown)} smaller ones")
         return "\n".join([f"{len(self)} instances", *lines])
+
+
+def with_boxes(rows: Iterable[Instance]) -> list[Instance]:
+    """The rows, which keep their oriented boxes from now on: all at once takes half the time of one after the other."""
+    rows = list(rows)
+    asked = [row for row in rows if row.points and "oriented_box" not in vars(row)]
+    for up in {id(row._up): row._up for row in asked}.values():
+        alike = [row for row in asked if row._up is up]
+        boxes = oriented_boxes([row.xyz[row.main_part] for row in alike], up)
+        for row, box in zip(alike, boxes, strict=True):
+            vars(row)["oriented_box"] = box
+    return rows
 
 
 def list_instances(
