@@ -18,7 +18,7 @@ from og_pointcloud.rendering.sightings import (
     sightings,
     sightings_of,
 )
-from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.rendering.splatting import BATCH, Gaussians
 from og_pointcloud.scene import NOT_SEEN, Camera
 
 CAMERA = Camera(48, 40, 60, 60, 24, 20, np.eye(4))
@@ -66,6 +66,19 @@ def test_openness_is_that_of_the_definition(seed: int) -> None:
     assert (expected[(found > 0) | (expected > 0)] < 0.5).any(), "the scene has points that are partly hidden"
     uv = CAMERA.project(splats.xyz)[0]
     np.testing.assert_allclose(np.stack([u, v], axis=1)[found > 0], uv[found > 0], atol=1e-4)
+
+
+@pytest.mark.parametrize(("scale", "opacity"), [(0.5, 0.02), (0.2, 0.9)])
+def test_more_splats_than_a_tile_fetches_at_once(scale: float, opacity: float) -> None:
+    """Faint ones leave light for some of those that are fetched next, opaque ones for none."""
+    depth = np.random.default_rng(0).uniform(0.5, 5, 3 * BATCH)
+    slopes = np.random.default_rng(1).uniform(-0.13, 0.13, (2, len(depth)))
+    splats = gaussians(np.stack([*(slopes * depth), depth], axis=1), scale, opacity)
+    thickness = np.full(len(depth), 0.1, np.float32)
+    expected = reference_openness(splats, CAMERA, thickness)
+    np.testing.assert_allclose(openness(splats, CAMERA, NEAR, thickness)[0], expected, atol=2e-5)
+    before_last = np.count_nonzero(depth < depth[expected > 0].max())
+    assert before_last > 1.2 * BATCH if opacity < 0.1 else before_last < BATCH
 
 
 def test_points_of_one_surface_do_not_hide_each_other() -> None:

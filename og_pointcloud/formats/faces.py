@@ -33,7 +33,8 @@ LEAST_SHARE = 0.005
 GRID = 257
 """Rays a side on which it is tried what a lens sees."""
 CACHED_MAPS = 12
-"""Faces whose maps are kept, 4 bytes a pixel each: those of two cameras whose images are read in turn."""
+"""Faces whose maps of masks are kept, 4 bytes a pixel each: those of two cameras whose images are read in turn. Of
+images, half as many, of 8 bytes."""
 CUBE = {
     "front": np.eye(3),
     "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -89,12 +90,8 @@ class Face:
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 of this view, by linear interpolation, black where the lens saw nothing. rgb: (h, w, 3), the
         distorted image."""
-        cv2 = require_cv2()
-        # OpenCV counts pixel centers at whole numbers. -2 lies outside of the image, and so is black.
-        x, y = (np.nan_to_num(pixels - 0.5, nan=-2.0).astype(np.float32) for pixels in _pixels(self._key))
-        border = cv2.BORDER_CONSTANT
-        if self.lens.wraps:
-            y, border = np.clip(y, 0, self.whole.height - 1), cv2.BORDER_WRAP
+        cv2, (x, y) = require_cv2(), _remap(self._key)
+        border = cv2.BORDER_WRAP if self.lens.wraps else cv2.BORDER_CONSTANT
         return np.asarray(cv2.remap(rgb, x, y, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
     @property
@@ -209,3 +206,12 @@ def _nearest(key: _Key) -> NDArray[np.int32]:
     with np.errstate(invalid="ignore"):
         flat = np.floor(row) * key[2][0] + np.floor(column)
     return np.where(np.isnan(flat), -1, flat).astype(np.int32)
+
+
+@lru_cache(maxsize=CACHED_MAPS // 2)
+def _remap(key: _Key) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(H, W) each: as `_pixels`, for OpenCV, which counts pixel centers at whole numbers; -2, outside of the image and
+    so black, where it has none."""
+    x, y = (np.nan_to_num(pixels - 0.5, nan=-2.0).astype(np.float32) for pixels in _pixels(key))
+    _, _, (_, height, *_), lens = key
+    return x, np.clip(y, 0, height - 1) if lens.wraps else y

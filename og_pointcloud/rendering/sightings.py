@@ -30,6 +30,7 @@ from og_pointcloud.rendering.splatting import (
     ascending,
     binned_splats,
     dim,
+    is_open,
     tile_buffer,
 )
 from og_pointcloud.scene import NOT_SEEN, Camera
@@ -126,12 +127,15 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
             for k in range(len(of_tile)):
                 surface[k] = splats[of_tile[k]].surface
             light[:] = np.float32(1)
-            drawn = fetched = starts[tile]
+            drawn, fetched, end = starts[tile], starts[tile], starts[tile + 1]
             for q in range(len(of_tile)):
                 # Draw on until the next splat is no longer in front of this point's surface.
-                while drawn < starts[tile + 1]:
+                while drawn < end:
                     if drawn == fetched:  # they lie all over memory: fetched at once, they do not wait for each other
-                        fetched = min(drawn + BATCH, starts[tile + 1])
+                        if not is_open(light, np.float32(LEAST_OPEN)):
+                            end = drawn  # all that is still to be asked is hidden
+                            break
+                        fetched = min(drawn + BATCH, end)
                         for k in range(drawn, fetched):
                             batch[k % BATCH] = splats[members[k]]
                     if not batch[drawn % BATCH]["depth"] < surface[q]:

@@ -552,7 +552,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
                     if through > 0.0:
                         rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
                         entry += 1
-                if not _is_open(light):
+                if not is_open(light, least[1]):
                     break
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts
@@ -662,13 +662,13 @@ def _add_by_mask(ids, shown, box, sum_of, touched):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _is_open(light):  # noqa: ANN001, ANN202
-    """Whether any pixel of a tile is unfinished."""
+def is_open(light, least):  # noqa: ANN001, ANN201
+    """Whether any pixel of a tile still has so much light."""
     brightest = spread(ZERO)
     for y in range(TILE):
         row = load(light, y * TILE)
         brightest = either(row > brightest, row, brightest)
-    return any_of(brightest > spread(ZERO))
+    return any_of(brightest >= spread(least))
 
 
 @njit(cache=True, nogil=True)
