@@ -66,8 +66,8 @@ class GeometrySettings(_Checked):
     """Gaussians of a plain cloud (geometry.py)."""
 
     scales: tuple[float, ...] = (0.35, 0.5, 0.7)
-    """Standard deviations tried, in point spacings; those of the best labels of held-out views (held_out.py).
-    Smaller ones cost seconds and, chosen by chance where sizes label alike, let rays through."""
+    """Standard deviations tried, in point spacings; those of the best labels of held-out views (held_out.py). Where the
+    smallest or the largest is clearly the best, the search goes on beyond. One alone is taken as it is."""
     opacity: float = 0.9
     """Opacity of every point: two layers of points hide what is behind them."""
     held_out_views: int = 24

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scenes import write_tiny_capture
 from scipy.sparse import csr_array
 
 import og_pointcloud as og
-from og_pointcloud.fitting.held_out import agreement, choose_scale
+from og_pointcloud.fitting.held_out import CLEARLY, STEP, agreement, choose_scale, search
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import near_plane, neighbourhood
@@ -42,6 +43,39 @@ def test_points_that_let_everything_through_are_not_taken(scene: Scene) -> None:
     settings = FitSettings(geometry=GeometrySettings(scales=(0.01, 0.5)))
     assert chosen(scene, settings).scale == 0.5
     assert chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.5, 6.0)))).scale == 0.5
+
+
+def test_the_search_goes_on_beyond_the_largest_while_that_is_clearly_better(scene: Scene) -> None:
+    """Points as fine as a tenth of their spacing: rays slip between them."""
+    choice = chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.1, 0.15))))
+    assert choice.scale > 0.15
+    assert choice.agreements[choice.scale] >= choice.agreements[0.15] + CLEARLY
+
+
+@pytest.mark.parametrize(
+    ("optimum", "found", "tried"),
+    [
+        (0.35, 0.35, {0.25}),  # the smallest, but one beyond is not better
+        (0.2, 0.25 / STEP, {0.25, 0.25 / STEP, 0.25 / STEP**2}),
+        (1.5, 0.7 * STEP**2, {0.7 * STEP, 0.7 * STEP**2, 0.7 * STEP**3}),
+        (0.5, 0.5, set()),
+    ],
+)
+def test_how_far_the_search_goes(optimum: float, found: float, tried: set[float]) -> None:
+    scales, asked = (0.35, 0.5, 0.7), []
+
+    def with_scales(more: Sequence[float]) -> dict[float, float]:
+        asked.extend(more)
+        return {scale: 0.9 - 0.1 * abs(np.log(scale / optimum)) for scale in asked}
+
+    best, agreements = search(scales, with_scales)
+    assert best == pytest.approx(found)
+    assert sorted(agreements) == pytest.approx(sorted({*scales, *tried}))
+
+
+def test_sizes_that_label_alike_are_not_searched_beyond() -> None:
+    best, agreements = search((0.35, 0.5, 0.7), lambda scales: dict(zip(scales, (0.8, 0.799, 0.79), strict=True)))
+    assert (best, set(agreements)) == (0.35, {0.35, 0.5, 0.7})
 
 
 def test_order_of_views_and_points_does_not_matter(scene: Scene) -> None:

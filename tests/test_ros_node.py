@@ -250,14 +250,17 @@ def test_a_parameter_file_names_every_parameter_with_its_default(rclpy, file, no
 
 @pytest.mark.parametrize("name", ["segment", "map"])
 def test_a_launch_file_names_what_its_node_takes(rclpy, name):
-    inputs = ["points"] if name == "segment" else importlib.import_module("og_pointcloud_ros.map_node").INPUTS
+    module = importlib.import_module(f"og_pointcloud_ros.{'node' if name == 'segment' else 'map_node'}")
+    inputs = ["points"] if name == "segment" else module.INPUTS
     launch = ElementTree.parse(PACKAGE / "launch" / f"{name}.launch.xml").getroot()
     arguments, node = {entry.get("name") for entry in launch.findall("arg")}, launch.find("node")
     assert {entry.get("from"): entry.get("to") for entry in node.findall("remap")} == {
         f"~/input/{role}": f"$(var {role})" for role in inputs
     }
-    (stated,) = [entry.get("name") for entry in node.findall("param") if entry.get("name")]
-    assert arguments == {*inputs, stated, "parameters"}
+    stated = {entry.get("name"): entry.get("value") for entry in node.findall("param") if entry.get("name")}
+    assert stated == {parameter: f"$(var {parameter})" for parameter in stated}
+    assert stated.keys() <= module.PARAMETERS.keys()
+    assert arguments == {*inputs, *stated, "parameters"}
     assert f'"{node.get("exec")} = ' in (PACKAGE / "setup.py").read_text().replace('f"', '"')
 
 

@@ -5,11 +5,13 @@ behind it. Which is worse depends on noise, density and floaters: the scene must
 other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
 those views show depends on the size too, so the labels of each size are judged with points of every size, and the best
 on average is taken. (Judged with their own size alone, large opaque points would always agree with themselves best.)
+A cloud of many noisy layers may want far smaller points than most: where the smallest is clearly the best, or the
+largest, the search goes on beyond.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +29,11 @@ from og_pointcloud.settings import FitSettings
 
 FEWEST_VIEWS = 4
 """Views needed: of fewer, a half has one view, which nothing in it contradicts."""
+STEP = 1.4
+"""From a size to the next one beyond the settings' own, which are as far apart."""
+CLEARLY = 0.005
+"""By how much a size must agree better than the others before one beyond it is tried, and that one before it is taken:
+sizes that label alike differ by less, by chance."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,8 @@ def choose_scale(
     settings: FitSettings,
     journal: Journal,
 ) -> ScaleChoice:
-    """The scale whose labels of half of the views reproduce the masks of the other half best.
+    """The scale whose labels of half of the views reproduce the masks of the other half best: of the settings' own, and
+    of smaller or larger ones while these are clearly better.
 
     spacing: (n,) of the points. near: depth of the near plane. Only some views and points are asked (see settings), but
     all points hide others. Does not depend on the order of views or points.
@@ -66,22 +74,50 @@ def choose_scale(
     asked = np.zeros(len(points), np.bool_)
     asked[sample] = True
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
-    tables = []  # by scale, one for each half of the views
-    for scale in journal.steps(geometry.scales, "point size"):
-        gaussians = isotropic(points, spacing, scale, geometry.opacity)
-        halves = (
-            mask_table(gaussians, chosen[half::2], near, thickness, by_sight=True, asked=asked) for half in (0, 1)
-        )
-        tables.append([table.of_points(sample) for table in halves])
-    # Labels of either half, at each scale, judged by the other half as every scale shows it.
-    agreements = np.zeros(len(geometry.scales))
-    for half in (0, 1):
-        for index in range(len(geometry.scales)):
-            ids, count = _labels(tables[index][half], around, settings)
-            agreements[index] += np.mean([agreement(judge[1 - half], ids, count) for judge in tables]) / 2
-    best = geometry.scales[int(np.argmax(agreements))] if agreements.any() else geometry.middle_scale
-    rounded = np.round(agreements, 4).tolist()
-    return ScaleChoice(best, dict(zip(geometry.scales, rounded, strict=True)))
+    halves = chosen[0::2], chosen[1::2]
+    tables: dict[float, list[MaskTable]] = {}  # by scale, one for each half of the views
+    labels: dict[float, list[tuple[NDArray[np.int32], int]]] = {}  # made from these
+
+    def with_scales(scales: Sequence[float]) -> dict[float, float]:
+        """The agreements of these scales and of all before, each judged by all."""
+        for scale in journal.steps(scales, "point size"):
+            drawn = isotropic(points, spacing, scale, geometry.opacity)
+            shown = (mask_table(drawn, half, near, thickness, by_sight=True, asked=asked) for half in halves)
+            tables[scale] = [table.of_points(sample) for table in shown]
+            labels[scale] = [_labels(table, around, settings) for table in tables[scale]]
+        return {scale: _agreement_of_halves(made, tables) for scale, made in labels.items()}
+
+    best, found = search(geometry.scales, with_scales)
+    rounded = {scale: round(value, 4) for scale, value in sorted(found.items())}
+    return ScaleChoice(best if any(found.values()) else geometry.middle_scale, rounded)
+
+
+def search(
+    scales: Sequence[float], with_scales: Callable[[Sequence[float]], dict[float, float]]
+) -> tuple[float, dict[float, float]]:
+    """The best of scales; where it is the smallest or the largest, and clearly the best, one STEP beyond, as long as
+    that is clearly better. And the agreements of all that were tried.
+
+    with_scales: the agreements of some scales and of all that it was asked for before.
+    """
+    found = with_scales(scales)
+    best = max(found, key=found.__getitem__)
+    while best in (min(found), max(found)) and _is_clear(best, found):
+        beyond = best / STEP if best == min(found) else best * STEP
+        found = with_scales([beyond])
+        if not _is_clear(beyond, found):
+            break
+        best = beyond
+    return best, found
+
+
+def _is_clear(best: float, found: dict[float, float]) -> bool:
+    return found[best] >= CLEARLY + max(value for scale, value in found.items() if scale != best)
+
+
+def _agreement_of_halves(made: list[tuple[NDArray[np.int32], int]], tables: dict[float, list[MaskTable]]) -> float:
+    """How well labels made from either half reproduce the masks of the other, as each scale shows it: the mean."""
+    return float(np.mean([agreement(shown[1 - half], *made[half]) for half in (0, 1) for shown in tables.values()]))
 
 
 def note_scale(choice: ScaleChoice, journal: Journal) -> None:
