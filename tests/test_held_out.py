@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scenes import write_tiny_capture
 from scipy.sparse import csr_array
 
 import og_pointcloud as og
+from og_pointcloud.fitting import held_out
 from og_pointcloud.fitting.held_out import CLEARLY, STEP, agreement, choose_scale, search
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import near_plane, neighbourhood
-from og_pointcloud.scene import Scene
+from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
 
@@ -85,6 +88,24 @@ def test_order_of_views_and_points_does_not_matter(scene: Scene) -> None:
     assert first.scale == second.scale
     for scale, value in first.agreements.items():
         assert second.agreements[scale] == pytest.approx(value, abs=2e-3)
+
+
+def test_masks_are_read_once_for_all_sizes_where_memory_allows(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: Counter[str] = Counter()
+
+    def counted(view: View) -> View:
+        def read() -> NDArray[np.int32]:
+            reads[view.name] += 1
+            return view.mask_map()
+
+        return replace(view, masks=read)
+
+    watched = replace(scene, views=tuple(map(counted, scene.views)))
+    choice = chosen(watched)
+    assert set(reads.values()) == {1}
+    monkeypatch.setattr(held_out, "memory_left", lambda _: 0)
+    assert chosen(watched) == choice
+    assert set(reads.values()) == {1 + len(choice.agreements)}
 
 
 def test_too_few_views_to_hold_some_out(scene: Scene) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from og_pointcloud.fitting.grouping import group_masks
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
 from og_pointcloud.fitting.membership import SceneVotes, assign_points, views_with_masks
+from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
@@ -27,6 +28,8 @@ from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
+MAPS_SHARE = 0.05
+"""Of the memory that a fit has left, mask maps may take so much: then they are read once, not for each size anew."""
 FEWEST_VIEWS = 4
 """Views needed: of fewer, a half has one view, which nothing in it contradicts."""
 STEP = 1.4
@@ -68,6 +71,9 @@ def choose_scale(
     chosen = [masked[index] for index in np.unique(spread)]
     if len(chosen) < FEWEST_VIEWS:
         return ScaleChoice(geometry.middle_scale, {})
+    size = sum(4 * view.camera.width * view.camera.height for view in chosen)
+    if size < MAPS_SHARE * memory_left(settings.memory):
+        chosen = [replace(view, masks=view.mask_map()) for view in chosen]
     # Neighbours are looked up within the sample, as the labels below are of the sample alone.
     sample = sample_of_points(points.xyz, geometry.held_out_points)
     around = neighbourhood(points.xyz[sample], geometry)
