@@ -43,6 +43,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
     "fitting.colors.SURENESS_POWER": ("", ()),
+    "fitting.held_out.CLEARLY": ("table", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -67,8 +68,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.missed_chance", "membership.island_share", "membership.own_vote", "membership.crossing",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
         "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
-        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
-        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "fitting.held_out.CLEARLY",
+        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
