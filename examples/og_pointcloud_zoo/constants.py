@@ -69,7 +69,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
         "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
         "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "fitting.held_out.CLEARLY",
-        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX",
+        "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
