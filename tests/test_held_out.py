@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -65,19 +64,14 @@ def test_the_search_goes_on_beyond_the_largest_while_that_is_clearly_better(scen
     ],
 )
 def test_how_far_the_search_goes(optimum: float, found: float, tried: set[float]) -> None:
-    scales, asked = (0.35, 0.5, 0.7), []
-
-    def with_scales(more: Sequence[float]) -> dict[float, float]:
-        asked.extend(more)
-        return {scale: 0.9 - 0.1 * abs(np.log(scale / optimum)) for scale in asked}
-
-    best, agreements = search(scales, with_scales)
+    scales = (0.35, 0.5, 0.7)
+    best, agreements = search(scales, lambda scale: 0.9 - 0.1 * abs(np.log(scale / optimum)))
     assert best == pytest.approx(found)
     assert sorted(agreements) == pytest.approx(sorted({*scales, *tried}))
 
 
 def test_sizes_that_label_alike_are_not_searched_beyond() -> None:
-    best, agreements = search((0.35, 0.5, 0.7), lambda scales: dict(zip(scales, (0.8, 0.799, 0.79), strict=True)))
+    best, agreements = search((0.35, 0.5, 0.7), {0.35: 0.8, 0.5: 0.799, 0.7: 0.79}.__getitem__)
     assert (best, set(agreements)) == (0.35, {0.35, 0.5, 0.7})
 
 

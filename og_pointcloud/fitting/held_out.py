@@ -3,10 +3,10 @@
 Too large, and points hide what lies behind their edge; too small, and rays slip through a surface and label what is
 behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are made from every
 other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
-those views show depends on the size too, so the labels of each size are judged with points of every size, and the best
-on average is taken. (Judged with their own size alone, large opaque points would always agree with themselves best.)
-A cloud of many noisy layers may want far smaller points than most: where the smallest is clearly the best, or the
-largest, the search goes on beyond.
+those views show depends on the size too, so the labels of each size are judged with points of each of the settings'
+sizes, and the best on average is taken. (Judged with their own size alone, large opaque points would always agree with
+themselves best.) A cloud of many noisy layers may want far smaller points than most: where the smallest is clearly the
+best, or the largest, the search goes on beyond.
 """
 
 from __future__ import annotations
@@ -81,36 +81,33 @@ def choose_scale(
     asked[sample] = True
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
     halves = chosen[0::2], chosen[1::2]
-    tables: dict[float, list[MaskTable]] = {}  # by scale, one for each half of the views
-    labels: dict[float, list[tuple[NDArray[np.int32], int]]] = {}  # made from these
 
-    def with_scales(scales: Sequence[float]) -> dict[float, float]:
-        """The agreements of these scales and of all before, each judged by all."""
-        for scale in journal.steps(scales, "point size"):
-            drawn = isotropic(points, spacing, scale, geometry.opacity)
-            shown = (mask_table(drawn, half, near, thickness, by_sight=True, asked=asked) for half in halves)
-            tables[scale] = [table.of_points(sample) for table in shown]
-            labels[scale] = [_labels(table, around, settings) for table in tables[scale]]
-        return {scale: _agreement_of_halves(made, tables) for scale, made in labels.items()}
+    def shown(scale: float) -> list[MaskTable]:
+        """What either half of the views shows with points of a scale."""
+        drawn = isotropic(points, spacing, scale, geometry.opacity)
+        tables = (mask_table(drawn, half, near, thickness, by_sight=True, asked=asked) for half in halves)
+        return [table.of_points(sample) for table in tables]
 
-    best, found = search(geometry.scales, with_scales)
+    judges = {scale: shown(scale) for scale in journal.steps(geometry.scales, "point size")}
+
+    def agreement_of(scale: float) -> float:
+        """How well labels made from either half reproduce the masks of the other."""
+        made = [_labels(table, around, settings) for table in judges.get(scale) or shown(scale)]
+        return float(np.mean([agreement(judge[1 - half], *made[half]) for half in (0, 1) for judge in judges.values()]))
+
+    best, found = search(geometry.scales, agreement_of)
     rounded = {scale: round(value, 4) for scale, value in sorted(found.items())}
     return ScaleChoice(best if any(found.values()) else geometry.middle_scale, rounded)
 
 
-def search(
-    scales: Sequence[float], with_scales: Callable[[Sequence[float]], dict[float, float]]
-) -> tuple[float, dict[float, float]]:
+def search(scales: Sequence[float], agreement_of: Callable[[float], float]) -> tuple[float, dict[float, float]]:
     """The best of scales; where it is the smallest or the largest, and clearly the best, one STEP beyond, as long as
-    that is clearly better. And the agreements of all that were tried.
-
-    with_scales: the agreements of some scales and of all that it was asked for before.
-    """
-    found = with_scales(scales)
+    that is clearly better. And the agreements of all that were tried."""
+    found = {scale: agreement_of(scale) for scale in scales}
     best = max(found, key=found.__getitem__)
     while best in (min(found), max(found)) and _is_clear(best, found):
         beyond = best / STEP if best == min(found) else best * STEP
-        found = with_scales([beyond])
+        found[beyond] = agreement_of(beyond)
         if not _is_clear(beyond, found):
             break
         best = beyond
@@ -119,11 +116,6 @@ def search(
 
 def _is_clear(best: float, found: dict[float, float]) -> bool:
     return found[best] >= CLEARLY + max(value for scale, value in found.items() if scale != best)
-
-
-def _agreement_of_halves(made: list[tuple[NDArray[np.int32], int]], tables: dict[float, list[MaskTable]]) -> float:
-    """How well labels made from either half reproduce the masks of the other, as each scale shows it: the mean."""
-    return float(np.mean([agreement(shown[1 - half], *made[half]) for half in (0, 1) for shown in tables.values()]))
 
 
 def note_scale(choice: ScaleChoice, journal: Journal) -> None:
