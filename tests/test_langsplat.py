@@ -134,6 +134,16 @@ def test_bad_ids_are_refused(tmp_path, change, message):
         read_language_features(tmp_path, ["a"], "large")
 
 
+@pytest.mark.parametrize("level", ["default", "small", "medium", "large"])
+def test_one_map_written_for_all_levels_is_read(tmp_path, level):
+    levels, features = literal_levels()
+    levels[:] = levels[0]
+    write(tmp_path, {"a": (levels, features)})
+    (layer,), _ = read_language_features(tmp_path, ["a"], level)
+    assert np.array_equal(layer.read(), levels[0])
+    assert np.array_equal(layer.features, features[: int(levels[0].max()) + 1].astype(layer.features.dtype))
+
+
 @pytest.mark.parametrize(
     ("levels", "features", "message"),
     [

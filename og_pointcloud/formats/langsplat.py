@@ -2,7 +2,7 @@
 
 The four levels are SAM's default, small, medium and large masks. Ids are cumulative: the small level goes on counting
 where the default level ended, so an id is a row of the feature file whatever its level; -1 is outside every mask.
-OpenGaussian trains on one level, the large one.
+OpenGaussian trains on one level, the large one. Tools that make masks of one level may write it as all four.
 
 One level is read. Its rows are compacted (rows that no pixel of the level shows are left out), and a view whose level
 holds no mask stays a view without masks: other levels never stand in for it, since one view's small masks
@@ -95,8 +95,9 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
         ids = stored.astype(np.int32)
     if (ids != stored).any():
         raise SceneError(f"{file}: level '{level}' holds values that are no ids; expected whole numbers, -1 for none")
-    # Id 0 is the first mask of the first level that has any.
-    if index and (ids == 0).any() and (levels[:index] >= 0).any():
+    # Id 0 is the first mask of the first level that has any. Equal levels share their rows.
+    others = [other for other in levels[:index] if (other >= 0).any()] if (ids == 0).any() else []
+    if not all(np.array_equal(other, stored) for other in others):
         raise SceneError(
             f"{file}: the ids of level '{level}' start at 0 again; expected ids that count on from level to level, as "
             "LangSplat writes them, so that an id is a row of the features"
