@@ -95,6 +95,17 @@ def test_feature_space(tmp_path):
         read_language_features(tmp_path, ["a"], "large")
 
 
+def test_feature_space_of_the_captures_own_words(tmp_path):
+    write(tmp_path, {"a": literal_levels()})
+    words = tmp_path / "text_features.npz"
+    np.savez(words, names=["chair"], vectors=np.ones((1, 512), np.float32), feature_space="my-clip")
+    assert read_language_features(tmp_path, ["a"], "large")[1] == "my-clip"
+    np.savez(words, names=["chair"], vectors=np.ones((1, 16), np.float32), feature_space="my-clip")
+    assert read_language_features(tmp_path, ["a"], "large")[1] == LANGSPLAT_SPACE, "of another width"
+    np.savez(words, names=["chair"], vectors=np.ones((1, 512), np.float32))
+    assert read_language_features(tmp_path, ["a"], "large")[1] == LANGSPLAT_SPACE, "words of no named space say nothing"
+
+
 def test_an_unknown_level_is_refused(tmp_path):
     with pytest.raises(SceneError, match="mask level is 'huge'; expected one of default, small, medium, large"):
         read_language_features(tmp_path, ["a"], "huge")

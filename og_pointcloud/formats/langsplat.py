@@ -21,15 +21,17 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError, printable
-from og_pointcloud.formats.mask_files import MaskLayer, as_features, require_all, rows_shown
-from og_pointcloud.formats.npy import mapped_array
+from og_pointcloud.formats.mask_files import MAX_FEATURE_BYTES, MaskLayer, as_features, require_all, rows_shown
+from og_pointcloud.formats.npy import mapped_array, read_npz
 from og_pointcloud.formats.poses import read_text
 
 LANGUAGE_FEATURES_FOLDER = "language_features"
 LEVELS = ("default", "small", "medium", "large")
 SPACE_FILE = "feature_space.txt"
+WORDS_FILE = "text_features.npz"
 LANGSPLAT_SPACE = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
-"""The encoder of LangSplat's own scripts, 512-d, unless ``feature_space.txt`` in the folder names another."""
+"""The encoder of LangSplat's own scripts, 512-d, unless ``feature_space.txt`` in the folder names another, or the
+capture's own words, of the same width, are of another."""
 LANGSPLAT_WIDTH = 512
 
 
@@ -59,7 +61,7 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
             f"{len(empty)} of {len(names)} views have no mask at level '{level}', e.g. '{printable(empty[0], 80)}'",
             stacklevel=2,
         )
-    return layers, _feature_space(folder, layers)
+    return layers, _feature_space(capture, layers)
 
 
 def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
@@ -105,9 +107,13 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
     return np.maximum(ids, -1)
 
 
-def _feature_space(folder: Path, layers: Sequence[MaskLayer]) -> str:
-    file = folder / SPACE_FILE
+def _feature_space(capture: Path, layers: Sequence[MaskLayer]) -> str:
+    file, words = capture / LANGUAGE_FEATURES_FOLDER / SPACE_FILE, capture / WORDS_FILE
     if file.is_file():
         return read_text(file).strip() or UNKNOWN_SPACE
     width = next(layer.features.shape[1] for layer in layers if len(layer.features))
+    if words.is_file():
+        stated = read_npz(words, ("vectors",), ("feature_space",), MAX_FEATURE_BYTES, "text features with 'vectors'")
+        if stated["vectors"].ndim == 2 and stated["vectors"].shape[1] == width and "feature_space" in stated:
+            return str(stated["feature_space"])
     return LANGSPLAT_SPACE if width == LANGSPLAT_WIDTH else UNKNOWN_SPACE
