@@ -34,7 +34,7 @@ def write_bag(folder, given, without=(), messages=messages_of):
         kinds = {topic: KINDS.get(role, "sensor_msgs/msg/Image") for role, topic in TOPICS.items()}
         kinds["/tf"] = "tf2_msgs/msg/TFMessage"
         out = {t: bag.add_connection(t, kind, typestore=store) for t, kind in kinds.items() if t not in without}
-        for frame in given:
+        for recorded, frame in enumerate(given):
             (x, y, z), (qx, qy, qz, qw) = (map(float, part) for part in place_of(frame))
             stamp, place = stamp_of(frame), make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
             turn = make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
@@ -44,7 +44,7 @@ def write_bag(folder, given, without=(), messages=messages_of):
             sent = {"/tf": make("tf2_msgs/msg/TFMessage", transforms=[where])}
             sent |= {TOPICS[role]: message for role, message in messages(make, frame).items()}
             for topic in out:
-                bag.write(out[topic], stamp, store.serialize_cdr(sent[topic], kinds[topic]))
+                bag.write(out[topic], recorded, store.serialize_cdr(sent[topic], kinds[topic]))
     return folder
 
 
@@ -74,6 +74,18 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys):
     assert "add --resume" in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0
     assert "8 frames" in capsys.readouterr().out
+
+
+def test_a_late_frame_is_resumed_too(tmp_path, capsys):
+    given = frames(THINGS)[:4]
+    given = [given[0], given[3], given[1], given[2]]  # as a bag holds them that was put together of two
+    bag, out = write_bag(tmp_path / "drive", given), tmp_path / "room.ogpc"
+    begun = og.Mapper(feature_space=SPACE, journal=tmp_path / "room.ogpc.map")
+    for frame in list(BagFrames(bag))[:2]:
+        begun.integrate(frame)
+    del begun
+    code, said, _ = run(capsys, "map", bag, "-o", out, "--feature-space", SPACE, "--resume")
+    assert (code, said.split(",")[0]) == (0, "2 frames")
 
 
 def test_reasons_that_are_not_shown_are_counted(tmp_path, capsys, monkeypatch):

@@ -373,7 +373,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
 
 def test_a_journal_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OgPointcloudError, match="file: File exists: check the path"):
+    with pytest.raises(OgPointcloudError, match=r"file' cannot be used \(File exists\)"):
         og.Mapper(journal=tmp_path / "file")
     (tmp_path / "j" / "frames.log").mkdir(parents=True)
     mapper = og.Mapper(feature_space=SPACE, journal=tmp_path / "j")
@@ -407,18 +407,37 @@ def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
     assert again._map.sequence == mapper._map.sequence
 
 
+def test_a_journal_is_one_mappers(tmp_path):
+    """Another process is kept out; in one process, as in a notebook, the mapper made last has it."""
+    given = frames(THINGS)[:2]
+    first, _ = mapped(given[:1], journal=tmp_path)
+    code = f"import og_pointcloud as og; og.Mapper(journal={str(tmp_path)!r})"
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert f"is in use by process {os.getpid()}" in other.stderr
+    second, _ = mapped(given[1:], journal=tmp_path)
+    with pytest.raises(OgPointcloudError, match="another mapper has gone on with"):
+        first.integrate(given[1])
+    del first, second
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path):
     resource = pytest.importorskip("resource")
     first, second, third = frames(THINGS)[:3]
     mapper, _ = mapped([first], journal=tmp_path)
-    limits, points = resource.getrlimit(resource.RLIMIT_FSIZE), mapper.points
+    turned = {first.stamp: first.camera.world_to_camera @ np.diag([-1.0, -1, 1, 1])}
+    limits, points, xyz = resource.getrlimit(resource.RLIMIT_FSIZE), mapper.points, mapper._map.points.xyz.copy()
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "frames.log").stat().st_size + 1000, limits[1]))
         with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the room there"):
             mapper.integrate(second)
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "frames.log").stat().st_size + 10, limits[1]))
+        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the room there"):
+            mapper.correct(turned)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert mapper.points == points, "a frame that was not written changed the map"
+    np.testing.assert_array_equal(mapper._map.points.xyz, xyz, "a correction that was not written moved the map")
     mapper.integrate(third)
     again = og.Mapper(feature_space=SPACE, journal=tmp_path)
     assert (again.last_stamp, again.points) == (third.stamp, mapper.points)
@@ -478,6 +497,11 @@ def test_a_queue_never_blocks_and_says_what_it_drops():
         broken.put(frame)
     broken.close()
     assert [text.split(":")[1] for text in said[-2:]] == [" ZeroDivisionError"] * 2
+    deaf = FrameQueue(mapper, on_change=seen.append, on_drop=lambda text: 1 / 0)
+    for frame in (replace(given[0], camera=None), given[1]):
+        deaf.put(frame)
+    deaf.close()
+    assert (len(seen), deaf.idle) == (5, True)
     said.clear()
     slow = FrameQueue(mapper, max_age=0.0, on_drop=said.append)
     slow.put(given[0])

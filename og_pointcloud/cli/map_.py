@@ -37,9 +37,9 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"'{work}' holds a map that was interrupted: add --resume, or remove it")
     frames = BagFrames(arguments.bag, arguments.frame)
     mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
-    resumed, refused, taken = mapper.last_stamp, {}, 0
+    refused, taken = {}, 0
     for frame in tqdm(frames, desc="frames", disable=None, leave=False):
-        if arguments.resume and frame.stamp is not None and frame.stamp <= resumed:  # the map holds it already
+        if arguments.resume and frame.stamp is not None and mapper.holds(frame.stamp):
             continue
         try:
             mapper.integrate(frame)

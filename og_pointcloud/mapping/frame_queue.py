@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Callable
 
@@ -53,7 +54,10 @@ class FrameQueue:
 
     def _work(self) -> None:
         while (waiting := self._waiting.get()) is not None:  # None: `close` asks for the end
-            self._take(*waiting)
+            try:
+                self._take(*waiting)
+            except Exception:  # of on_drop: nobody is left to be told, and the thread lives on
+                traceback.print_exc()
             self._done += 1
 
     def _take(self, arrived: float, frame: Frame) -> None:

@@ -149,14 +149,18 @@ class GrowingMap:
         """(3,) middle of points, world coordinates: the median, as votes give an object some points far off it."""
         return np.median(self.points.xyz[rows].astype(np.float64), axis=0) + self.origin
 
-    def correct(self, poses: Mapping[float, ArrayLike]) -> dict[float, NDArray[np.float64]]:
-        """Move what the frames of these stamps brought: stamp -> corrected world_to_camera, from world coordinates.
-        Returns the poses, checked."""
+    def checked_poses(self, poses: Mapping[float, ArrayLike]) -> dict[float, Camera]:
+        """Stamp -> a camera with the corrected world_to_camera of that frame. SceneError or a warning as
+        `Mapper.correct`."""
         if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
             raise SceneError(f"a pose is of frame {strange[0]!r}; expected the frame's stamp, a number")
         cameras = {float(t): Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose)) for t, pose in poses.items()}
+        self._warn_of_strange(cameras.keys())
+        return cameras
+
+    def correct(self, cameras: Mapping[float, Camera]) -> None:
+        """Move what the frames of these stamps brought. cameras: of `checked_poses`."""
         corrected = {stamp: in_local_frame(camera, self.origin).world_to_camera for stamp, camera in cameras.items()}
-        self._warn_of_strange(corrected.keys())
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:
                 # A point keeps its place in the frame of its camera: out of the old pose, into the corrected one.
@@ -173,14 +177,16 @@ class GrowingMap:
             self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
         # Snapshots are remembered by the sequence: they are made anew after a correction.
         self.count(self.stamp)
-        return {stamp: camera.world_to_camera for stamp, camera in cameras.items()}
+
+    @property
+    def remembered_since(self) -> float:
+        """Of frames before this stamp only some are remembered."""
+        return min(self.recent) if len(self.recent) == RECENT_FRAMES else -np.inf
 
     def _warn_of_strange(self, stamps: Collection[float]) -> None:
         """Warn of stamps of no frame, or, where all are such, SceneError: seconds were taken for nanoseconds, say."""
         known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
-        # Of frames before the recent ones only some are remembered.
-        since = min(self.recent) if len(self.recent) == RECENT_FRAMES else -np.inf
-        strange = [stamp for stamp in stamps if stamp not in known and stamp >= since]
+        strange = [stamp for stamp in stamps if stamp not in known and stamp >= self.remembered_since]
         some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
         if strange and len(strange) == len(stamps):
             there = f", {min(known):.15g} to {max(known):.15g}" if known else ""

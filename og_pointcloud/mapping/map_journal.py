@@ -17,16 +17,18 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import locked, replacing
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.frame import Frame, in_arrays
@@ -57,18 +59,26 @@ Poses = dict[float, NDArray[np.float64]]
 """A correction: stamp -> world_to_camera (4, 4)."""
 
 
+_OPEN: WeakValueDictionary[Path, MapJournal] = WeakValueDictionary()
+"""The journals of this process."""
+
+
 class MapJournal:
-    """The folder of one map. OgPointcloudError where it cannot be written, or holds the map of something else.
+    """The folder of one map. OgPointcloudError where it cannot be written, holds the map of something else, or is
+    another process's; within one process, whoever opened it last has it.
 
     origin: what the map began with, in words; a folder that was begun with something else is refused.
     """
 
     def __init__(self, folder: str | os.PathLike[str], origin: str) -> None:
         self.folder = Path(folder)
-        with naming(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
         self._log, self._state, self._origin = self.folder / "frames.log", self.folder / "map.state", origin
         self._file: io.FileIO | None = None
+        if earlier := _OPEN.pop(self.folder.resolve(), None):
+            earlier._lock.close()
+        self._lock = ExitStack()
+        self._lock.enter_context(locked(self.folder))
+        _OPEN[self.folder.resolve()] = self
 
     def state(self) -> GrowingMap | None:
         """The last whole map; None where there is none yet."""
@@ -114,10 +124,12 @@ class MapJournal:
             change = in_arrays(change)
             if change.masks is not None and change.masks.max(initial=0) < 1 << 15:
                 change = replace(change, masks=change.masks.astype(np.int16))
+        if _OPEN.get(self.folder.resolve()) is not self:
+            raise OgPointcloudError(f"another mapper has gone on with '{self.folder}': this one cannot write there")
         record = _record((number, change))
         with naming(self.folder):
             self._file = self._file or self._log.open("ab", buffering=0)
-            whole = self._file.tell()
+            whole = self._file.seek(0, os.SEEK_END)  # a write that failed has moved its place
             try:
                 if self._file.write(record) < len(record):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -179,6 +179,11 @@ class Mapper:
         """The latest stamp of all frames so far."""
         return -1.0 if self._map is None else self._map.stamp
 
+    def holds(self, stamp: float) -> bool:
+        """Whether a frame of this stamp is in the map; of one before the last few thousand frames it is believed."""
+        known = self._map
+        return known is not None and (stamp in known.recent or stamp < known.remembered_since)
+
     @property
     def points(self) -> int:
         """How many points the map has."""
@@ -261,11 +266,12 @@ class Mapper:
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
         if self._map is None:
             raise SceneError("no frame was integrated yet, so there is nothing to correct: integrate some first")
-        number = self._map.sequence
-        corrected = self._map.correct(poses)
+        cameras = self._map.checked_poses(poses)
+        if self._journal is not None:
+            self._journal.append(self._map.sequence, {stamp: of.world_to_camera for stamp, of in cameras.items()})
+        self._map.correct(cameras)
         self._around = None
         if self._journal is not None:
-            self._journal.append(number, corrected)
             self._journal.settle(self._map)
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
