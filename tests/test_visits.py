@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from labelled_clouds import instance_table
+from labelled_clouds import instance_table, make_cloud
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -371,6 +372,17 @@ def test_a_part_of_the_place_leaves_the_rest_as_it_was(monday):
         assert instance_of(seen.cloud, thing) == instance_of(monday, thing)
 
 
+def test_a_visit_without_colors_leaves_the_map_its_own(monday):
+    visit = scene(AFTER, seed=1)
+    plain = replace(visit, points=replace(visit.points, rgb=None))
+    cloud, bare = og.update(monday, plain, progress=False).cloud, og.fit(plain, progress=False)
+    kept = np.isin(cloud.xyz, monday.xyz).all(axis=1)
+    assert 0 < np.count_nonzero(~kept) < np.count_nonzero(kept)
+    assert (cloud.rgb[~kept] == 128).all()
+    np.testing.assert_array_equal(cloud.rgb[kept], monday.rgb[np.isin(monday.xyz, cloud.xyz[kept]).all(axis=1)])
+    assert og.update(bare, plain, progress=False).cloud.rgb is None
+
+
 def test_a_map_survives_its_file(updated, tmp_path):
     path = og.write_bundle(updated.cloud, tmp_path / "map.ogpc")
     read = og.load(path).cloud
@@ -430,6 +442,19 @@ def test_the_commands_write_what_changed(monday, friday, tmp_path, capsys):
     assert main(["compare", str(one), str(other), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == og.compare(monday, friday).to_dict()
+
+
+def test_memory_does_not_grow_with_the_square_of_the_instances():
+    """Two visits of 3,000 tiles of 4 points; a table of 3,000 x 3,000 float64 would be 72 MB."""
+    corner = np.stack(np.meshgrid(np.arange(120), np.arange(100)), axis=-1).reshape(-1, 2)
+    ids = corner[:, 0] // 2 + 60 * (corner[:, 1] // 2)
+    tiles = make_cloud(0.02 * np.c_[corner - [60, 50], np.zeros(len(ids))], ids, words=None)
+    tiles = replace(tiles, cameras=tuple(cameras(2)))
+    tracemalloc.start()
+    assert str(og.compare(tiles, tiles)) == "0 gone, 0 new, 0 moved, 0 not seen again"
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 72e6
 
 
 def test_a_camera_without_a_view_of_anything_says_nothing(monday):

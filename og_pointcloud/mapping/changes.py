@@ -31,6 +31,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.mapping.likeness import (
     ALIKE,
     FEWEST_SAME,
+    MOST_ROWS,
     OTHER_COLOR,
     Look,
     Scale,
@@ -240,18 +241,19 @@ def _unmoved(
 ) -> NDArray[np.int64]:
     """(m, 2) instances of both visits that share most of their surface with each other, neither left nor came, and have
     descriptors."""
-    owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], BACKGROUND)
-    shared = later.shared(owners, len(left))[:, :-1].T  # (earlier, later) points, without those on no instance
-    if not shared.size:
+    if not len(left) or not len(came):
         return np.zeros((0, 2), np.int64)
-    shared[left], shared[:, came] = 0, 0
+    owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], BACKGROUND)
+    stayed = ~np.append(left, [True, True])[owners] & ~np.append(came, [True, True])[later.cloud.instance_ids]
+    shared = later.shared(np.where(stayed, owners, BACKGROUND), len(left))
     described = [
         np.isin(np.arange(len(v.cloud.instances)), v.cloud.instances.descriptor_instance) for v in (earlier, later)
     ]
     # Best partners of each other.
-    one = np.flatnonzero((shared.max(axis=1) >= FEWEST_POINTS) & described[0])
-    other = shared[one].argmax(axis=1)
-    mutual = (shared[:, other].argmax(axis=0) == one) & described[1][other]
+    partner, of_later = (np.asarray(shared.argmax(axis=axis)).ravel() for axis in (0, 1))
+    one = np.flatnonzero((shared.max(axis=0).toarray().ravel() >= FEWEST_POINTS) & described[0])
+    other = partner[one]
+    mutual = (of_later[other] == one) & described[1][other]
     return np.stack([one, other], axis=1)[mutual]
 
 
@@ -259,14 +261,18 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     """What cosines and colours mean, by what has not moved, (m, 2): how alike the two visits show each thing, and how
     alike it is to the other thing that is most like it."""
     a, b = earlier.cloud.instances, later.cloud.instances
-    between = cosines(a, b)[np.ix_(*unmoved.T)]  # on the diagonal, each thing with itself
     # Adjoining instances may be parts of one thing: they are no other things.
-    adjoining = later.adjoining[np.ix_(unmoved[:, 1], unmoved[:, 1])]
-    others = np.where(adjoining, -np.inf, between).max(axis=1, initial=-np.inf)
-    others = others[np.isfinite(others)]
+    adjoining, itself = later.adjoining[unmoved[:, 1]][:, unmoved[:, 1]], np.arange(len(unmoved))
+    own, most = np.zeros((2, len(unmoved)))
+    for rows in np.array_split(itself, 1 + len(unmoved) // MOST_ROWS):
+        between = cosines(a, unmoved[rows, 0], b, unmoved[:, 1])
+        own[rows] = between[rows - rows[:1], rows]
+        between[rows - rows[:1], rows] = between[adjoining[rows].nonzero()] = -np.inf
+        most[rows] = between.max(axis=1, initial=-np.inf)
+    others = most[np.isfinite(most)]
     if len(others) < FEWEST_SAME:
         return Scale(other=typical_cosine(b.descriptors, spread_of(b.agreement, b.masks)[b.descriptor_instance]))
-    same, other = float(np.median(between.diagonal())), float(np.median(others))
+    same, other = float(np.median(own)), float(np.median(others))
     one, two = earlier.cloud.rgb, later.cloud.rgb
     if one is None or two is None:
         return Scale(same, other)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.cloud import InstanceTable, best_of_rows
 
 ALIKE = 0.5
 """Likeness from which on two are one thing: halfway between 0, as of different things, and 1, as of one thing."""
@@ -110,13 +110,21 @@ def descriptors_of(table: InstanceTable, instance: int) -> tuple[NDArray[np.floa
     return table.descriptors[table.descriptor_instance == instance], float(spread)
 
 
-def cosines(one: InstanceTable, other: InstanceTable) -> NDArray[np.float64]:
-    """(len(one), len(other)) cosines of the two nearest descriptors, corrected for spread; -inf without any."""
-    factors = [np.sqrt(1 + spread_of(t.agreement, t.masks))[t.descriptor_instance] for t in (one, other)]
-    nearest = np.full((len(one), len(other)), -np.inf)
-    rows = np.ix_(one.descriptor_instance, other.descriptor_instance)
-    np.maximum.at(nearest, rows, (one.descriptors @ other.descriptors.T) * np.outer(*factors))
-    return nearest
+def cosines(
+    one: InstanceTable, of_one: NDArray[np.integer], other: InstanceTable, of_other: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """(m, k) cosines of the two nearest descriptors of m instances of one table and k of the other, all different;
+    corrected for spread, -inf without any."""
+    rows, owners, factors = [], [], []
+    for table, chosen in ((one, of_one), (other, of_other)):
+        place = np.full(len(table), -1)
+        place[chosen] = np.arange(len(chosen))
+        owner = place[table.descriptor_instance]
+        rows.append(table.descriptors[owner >= 0])
+        owners.append(owner[owner >= 0])
+        factors.append(np.sqrt(1 + spread_of(table.agreement, table.masks))[chosen])
+    nearest = best_of_rows(best_of_rows(rows[0] @ rows[1].T, owners[0], len(of_one)).T, owners[1], len(of_other)).T
+    return nearest * np.outer(*factors)
 
 
 def typical_cosine(rows: NDArray[np.floating], spread: NDArray[np.float64]) -> float:

@@ -19,6 +19,7 @@ from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.formats.colors import UNKNOWN_COLOR
 from og_pointcloud.mapping.changes import SAME_SURFACE, Changes, Comparison, compare_visits
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
 from og_pointcloud.mapping.presence import FEWEST_POINTS, MOST, Visit
@@ -89,12 +90,13 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     def both(first: NDArray[Any] | None, second: NDArray[Any] | None) -> NDArray[Any] | None:
         return None if first is None or second is None else np.concatenate([first[stays], second[adds]])
 
+    colors = [np.full((len(cloud), 3), UNKNOWN_COLOR, np.uint8) if cloud.rgb is None else cloud.rgb for cloud in (a, b)]
     merged = replace(
         a,
         xyz=np.concatenate([a.xyz[stays], b.xyz[adds]]),
         instance_ids=ids,
         instances=joined(a.instances, b.instances, ids_of_later, ids),
-        rgb=both(a.rgb, b.rgb),
+        rgb=None if a.rgb is None and b.rgb is None else both(*colors),
         certainty=both(a.certainty, b.certainty),
         provenance=record.added_to(a.provenance),
         cameras=(*a.cameras, *b.cameras)[-MOST_CAMERAS:],
@@ -120,9 +122,11 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
     """
     count = fresh = len(earlier.cloud.instances)
     on_map = (found.nearest >= 0) & stays[found.nearest]
-    shared = later.shared(np.where(on_map, earlier.cloud.instance_ids[found.nearest], UNOBSERVED), count)
-    best, most = shared.argmax(axis=1), shared.max(axis=1)
-    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))  # column count: on none
+    owners = earlier.cloud.instance_ids[found.nearest]
+    on_none = np.where(owners == BACKGROUND, count, owners)  # a column of their own
+    shared = later.shared(np.where(on_map, on_none, UNOBSERVED), count + 1)
+    best, most = (np.asarray(of).ravel() for of in (shared.argmax(axis=1), shared.max(axis=1).toarray()))
+    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))
     map_ids, came = np.where(was_there, best, -1), {moved.now: moved.id for moved in found.changes.moved}
     for k in range(len(map_ids)):
         # All pieces of a thing that came get one id: the one it had, if it moved, else the first piece's fresh one.

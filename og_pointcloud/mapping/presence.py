@@ -15,11 +15,13 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
+from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.association import members_of
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.likeness import Look, descriptors_of
@@ -150,20 +152,18 @@ class Visit:
         return (self.surface.seen_from(camera) for camera in (self.cloud.cameras if cameras is None else cameras))
 
     @cached_property
-    def rows(self) -> list[NDArray[np.int64]]:
+    def rows(self) -> list[NDArray[np.intp]]:
         """Rows of each instance's points, ascending."""
-        ids = self.cloud.instance_ids
-        order = np.argsort(ids, kind="stable")
-        return np.split(order, np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1)))[1:-1]
+        return members_of(self.cloud.instance_ids, len(self.cloud.instances))
 
     @cached_property
-    def adjoining(self) -> NDArray[np.bool_]:
-        """(instances, instances): whether some points of the two are neighbours; each adjoins itself."""
-        ids, touching = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
+    def adjoining(self) -> csr_array:
+        """(instances, instances) bool: whether some points of the two are neighbours."""
+        ids, count = self.cloud.instance_ids, len(self.cloud.instances)
+        touching = csr_array((count, count), dtype=np.bool_)
         for neighbour in self.around.index.T:
-            both = (ids >= 0) & (ids[neighbour] >= 0)
-            touching[ids[both], ids[neighbour[both]]] = True
-        return touching | touching.T
+            touching += _pairs(ids, ids[neighbour], (count, count)).astype(np.bool_)
+        return (touching + touching.T).tocsr()
 
     def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
         """How an instance looks, by some of its points."""
@@ -179,15 +179,10 @@ class Visit:
         rows = np.flatnonzero(chosen & (ids >= 0))
         return np.asarray(np.bincount(ids[rows], weight[rows], len(self.cloud.instances)), np.float64)
 
-    def shared(self, owners: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-        """(instances, count + 1) how many points of each instance lie on each of another visit's ``count`` instances;
-        in the last column those on background. owners: (n,) the other's instance at each point; UNOBSERVED is not
-        counted."""
-        ids = self.cloud.instance_ids
-        both = (ids >= 0) & (owners > UNOBSERVED)
-        cell = ids[both] * np.int64(count + 1) + owners[both] % (count + 1)  # BACKGROUND, -1, is the last column
-        shape = len(self.cloud.instances), count + 1
-        return np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+    def shared(self, owners: NDArray[np.integer], count: int) -> csr_array:
+        """(instances, count) int64, how many points of each instance lie on each of another visit's ``count``
+        instances. owners: (n,) the other's instance at each point; negative ones are not counted."""
+        return _pairs(self.cloud.instance_ids, owners, (len(self.cloud.instances), count))
 
     def telling(self, tolerance: float) -> NDArray[np.bool_]:
         """(n,) bool: points that lie off the surfaces of all other instances near them: something measured there is of
@@ -265,6 +260,13 @@ class Evidence:
         rows = visit.rows[instance]
         rows = rows[self.shown[rows]]
         return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))
+
+
+def _pairs(rows: NDArray[np.integer], columns: NDArray[np.integer], shape: tuple[int, int]) -> csr_array:
+    """How often each pair of a row and a column stands in the arrays (n,), int64; negative ones are left out."""
+    both = (rows >= 0) & (columns >= 0)
+    ones = np.ones(np.count_nonzero(both), np.int64)
+    return coo_array((ones, (rows[both], columns[both])), shape=shape).tocsr()
 
 
 @njit(cache=True, nogil=True)
