@@ -238,16 +238,32 @@ def test_a_folder_by_image_name(tmp_path):
     assert polygon.masks[0][5:20, 5:25].all()
     assert polygon.masks[0].mean() == pytest.approx(31 * 41 / 120 / 160, rel=0.1)
     assert len(folder.of("d", (4, 5))) == 0
+    assert len(folder.of("rgb/c", (60, 80))) == 1
     with pytest.raises(SceneError, match="no masks for image 'e'"):
         folder.of("e", (4, 5))
 
 
+def test_images_of_a_rig_that_share_a_stem_keep_their_own_masks(tmp_path):
+    """Two cameras have a 000.png each: their views are called left/000 and right/000."""
+    cameras, square = ("left", "right"), [0, 0, 9, 0, 9, 9, 0, 9]
+    images = [
+        {"id": k, "file_name": f"images/{name}/000.png", "height": 10, "width": 10} for k, name in enumerate(cameras)
+    ]
+    annotations = [{"image_id": k, "score": 0.25 * (k + 1), "segmentation": [square]} for k in range(2)]
+    (tmp_path / "all.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+    for k, name in enumerate(cameras):
+        assert ExistingMasks(tmp_path).of(f"{name}/000", (10, 10)).scores.tolist() == [0.25 * (k + 1)]
+    with pytest.raises(SceneError, match="2 images that '000' could be"):
+        ExistingMasks(tmp_path).of("000", (10, 10))
+
+
 @pytest.mark.parametrize(
-    "text", ["{", "[1]", '[{"segmentation": 3}]', '[{"segmentation": [[1, 2]], "size": [9, 9]}]', '{"a": 1}']
-)
+    "text", ["{", "[1]", '[{"segmentation": 3}]', '[{"segmentation": [[1, 2]], "size": [9, 9]}]', '{"a": 1}',
+             '{"images": [{"id": [1], "file_name": "b.png"}]}'],
+)  # fmt: skip
 def test_broken_annotation_files(tmp_path, text):
-    (tmp_path / "a.json").write_text(text)
-    with pytest.raises(SceneError):
+    (tmp_path / ("all.json" if "images" in text else "a.json")).write_text(text)
+    with pytest.raises(SceneError, match=r"expected|valid"):
         ExistingMasks(tmp_path).of("a", (9, 9))
 
 

@@ -11,7 +11,8 @@ from scenes import camera, distance_to_surface, look, write_image
 from og_pointcloud.cli import main
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.capture import read_geometry, read_poses
-from og_pointcloud.formats.structure_from_motion import ALL_PAIRS, NEIGHBOURS, _pairs, _to_z, find_poses
+from og_pointcloud.formats.poses import upright_axes
+from og_pointcloud.formats.structure_from_motion import ALL_PAIRS, NEIGHBOURS, _pairs, find_poses
 
 SIZE = 320, 240
 VIEWS = 9
@@ -157,7 +158,7 @@ def test_pairs(count):
 def test_up_becomes_z(seed):
     up = np.random.default_rng(seed).normal(size=3)
     up /= np.linalg.norm(up)
-    rotation = _to_z(up)
+    rotation = upright_axes(up)
     np.testing.assert_allclose(rotation @ up, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) > 0

@@ -64,6 +64,7 @@ from og_pointcloud.text.encoder import TextEncoder, check_templates
 
 ROOT = Path(__file__).resolve().parents[1]
 ESCAPE = "\x1b]0;owned\x07\x1b[2J"
+UNBREAKABLE = "1\u00a0kg"
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +293,7 @@ def rude(bundle, tmp_path_factory):
         stages = [{"name": ESCAPE, "seconds": 1.0}]
         manifest["provenance"].update(warnings=[ESCAPE * 1000], stages=stages, left_out=[note])
 
-    names = ["=cmd|' /C calc'!A0", f"{ESCAPE}red", "chair\u202etxt", "A" * 1000, "+1"]
+    names = ["=cmd|' /C calc'!A0", f"{ESCAPE}red", "chair\u202etxt", "A" * 1000, UNBREAKABLE]
     changes = {"vocabulary/names.json": json.dumps(names).encode()}
     return forged(bundle, tmp_path_factory.mktemp("rude") / "s.ogpc", changes, edit)
 
@@ -311,6 +312,12 @@ def test_nothing_in_a_file_reaches_the_terminal_as_it_is(rude, capsys, command):
         assert json.loads(said.out)["words"][1] == f"{ESCAPE}red"
     if "--labels" in command:
         assert "touch OWNED; '\"'\"''" in said.err, "the command that is advised quotes what it names"
+
+
+@pytest.mark.parametrize("command", [["instances", "--words", "5"], ["select", UNBREAKABLE]], ids=" ".join)
+def test_json_of_any_name_can_be_read(rude, capsys, command):
+    assert main([command[0], str(rude), *command[1:], "--json"]) == 0
+    assert json.dumps(UNBREAKABLE) in json.dumps(json.loads(capsys.readouterr().out))
 
 
 def test_cells_of_tables_are_no_formulas(rude, tmp_path):

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.poses import quaternion_of
+from og_pointcloud.formats.poses import quaternion_of, upright_axes
 
 DoubleArray = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ def _boxes_around(sets: Sequence[DoubleArray], up: DoubleArray | None) -> Iterat
     if up is None:
         all_axes = _least_volume(padded, np.stack([_principal_axes(local) for local in centered]))
     else:
-        all_axes = _turned_about(padded, np.broadcast_to(_upright(up), (len(sets), 3, 3)))
+        all_axes = _turned_about(padded, np.broadcast_to(upright_axes(up), (len(sets), 3, 3)))
     for local, middle, axes in zip(centered, middles, all_axes, strict=True):
         along = local @ axes.T
         low, high = along.min(axis=0), along.max(axis=0)
@@ -275,14 +275,6 @@ def _least_volume(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
         if not len(going):
             break
     return axes
-
-
-def _upright(up: DoubleArray) -> DoubleArray:
-    """Three axes, the third of which is up."""
-    # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
-    aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    aside /= np.linalg.norm(aside)
-    return np.asarray([aside, np.cross(up, aside), up], np.float64)
 
 
 def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:

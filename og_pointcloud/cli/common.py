@@ -140,11 +140,14 @@ def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
 def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show: Callable[[Any], None]) -> None:
     """Print a result as JSON where --json was given, else by ``show``."""
     if arguments.json:
-        # Readable as it stands; only what a terminal would act on is escaped, as JSON escapes it.
-        text = json.dumps(result, indent=2, ensure_ascii=False)
-        print("".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text))
+        print_json(json.dumps(result, indent=2, ensure_ascii=False))
     else:
         show(result)
+
+
+def print_json(text: str) -> None:
+    """Print JSON readable as it stands; only what a terminal would act on is escaped, as JSON escapes it."""
+    print("".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text.rstrip()))
 
 
 def print_next(*words: object, hint: str = "") -> None:

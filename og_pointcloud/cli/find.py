@@ -19,6 +19,7 @@ from og_pointcloud.cli.common import (
     as_given,
     check_at_least,
     numbers,
+    print_json,
     print_next,
     print_table,
 )
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
     for note in findings.not_asked:
         print(f"warning: {printable(note)}", file=sys.stderr)
     if arguments.json:
-        print(findings.to_json())
+        print_json(findings.to_json())
         return
     if findings:
         print_table(("scene", "instance", "word", "score", "center", "size"), [cells(finding) for finding in findings])

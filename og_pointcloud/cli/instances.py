@@ -8,7 +8,16 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, check_at_least, direction, print_next
+from og_pointcloud.cli.common import (
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    check_at_least,
+    direction,
+    print_json,
+    print_next,
+)
 
 
 def add(parser: Parser) -> None:
@@ -25,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
         write = table.to_csv if arguments.output.suffix == ".csv" else table.to_json
         write(arguments.output)
     if arguments.json:
-        print(table.to_json(), end="")
+        print_json(table.to_json())
         return
     print(table)
     if arguments.output:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_option, add_shared, calibration_hint, names_in, print_next
+from og_pointcloud.cli.common import Parser, add_option, add_shared, calibration_hint, names_in, print_json, print_next
 
 
 def add(parser: Parser) -> None:
@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace) -> None:
     against = names_in(arguments.against)
     selection = og.select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)
     if arguments.json:
-        print(selection.to_json())
+        print_json(selection.to_json())
         return
     print(selection)
     if selection.unknown:

@@ -186,6 +186,14 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
 
 
+def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) right-handed orthonormal rows, the third of which is a unit vector up."""
+    # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
+    aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    aside /= np.linalg.norm(aside)
+    return np.stack([aside, np.cross(up, aside), up])
+
+
 def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:
     """The camera seen from local coordinates, world = local + origin.
 

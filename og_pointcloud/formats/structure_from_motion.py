@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.formats.images import image_size
-from og_pointcloud.formats.poses import numbered_images
+from og_pointcloud.formats.poses import numbered_images, upright_axes
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import Journal
 
@@ -215,11 +214,4 @@ def _turn_upright(model: Any) -> None:
     up = -np.mean([pose[1, :3] for pose in poses], axis=0)
     if np.linalg.norm(up) > np.finfo(np.float64).eps:
         colmap = _pycolmap()
-        model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(_to_z(up / np.linalg.norm(up))), np.zeros(3)))
-
-
-def _to_z(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rotation that takes a unit vector to z: its rows are an orthonormal, right-handed frame with up last."""
-    side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
-    side /= np.linalg.norm(side)
-    return np.stack([side, np.cross(up, side), up])
+        model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(upright_axes(up / np.linalg.norm(up))), np.zeros(3)))

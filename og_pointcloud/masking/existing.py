@@ -128,10 +128,16 @@ class ExistingMasks:
             return _resized(from_ids(read_ids(png), none=-1, tracks=self.tracks), shape)
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
-        stem = image_name.rsplit("/", 1)[-1]
-        for key in (image_name, stem):
-            if key in self._coco:
-                return _resized(_from_annotations(self._coco[key], f"{self.folder}, image '{key}'"), shape)
+        # Views are called by their stems, or by paths below a folder that COCO's paths may begin with.
+        alike = [key for key in self._coco if key.rsplit("/", 1)[-1] == image_name.rsplit("/", 1)[-1]]
+        named = [key for key in alike if f"/{key}".endswith(f"/{image_name}")] or alike
+        if len(named) == 1:
+            return _resized(_from_annotations(self._coco[named[0]], f"{self.folder}, image '{named[0]}'"), shape)
+        if named:
+            raise SceneError(
+                f"{self.folder} lists {len(named)} images that '{image_name}' could be ({', '.join(named):.120}); "
+                "expected one: give COCO the paths that the pose file has"
+            )
         raise SceneError(
             f"{self.folder} has no masks for image '{image_name}'; expected {png.name}, {single.name}, or a COCO .json "
             "that lists it"
@@ -139,25 +145,26 @@ class ExistingMasks:
 
     @cached_property
     def _coco(self) -> dict[str, list[dict[str, Any]]]:
-        """Annotations by image stem, each with the image's size, from all COCO files of the folder."""
+        """Annotations by image path without suffix, each with the image's size, from all COCO files of the folder."""
         found: dict[str, list[dict[str, Any]]] = {}
         for file in sorted(self.folder.glob("*.json")):
             content = read_json(file, MAX_JSON_BYTES)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
             # COCO lists images and annotations apart; polygons need the size of their image.
-            stems: dict[Any, tuple[str, list[Any]]] = {}
+            images: dict[Any, tuple[str, list[Any]]] = {}
             for image in content["images"]:
-                if not isinstance(image, dict) or not isinstance(image.get("file_name"), str):
+                known = isinstance(image, dict) and isinstance(image.get("id"), (int, str, type(None)))
+                if not known or not isinstance(image.get("file_name"), str):
                     raise SceneError(f"{file}: an image is {image!r:.60}; expected id, file_name, height and width")
-                stem = without_suffix(image["file_name"]).rsplit("/", 1)[-1]
-                stems[image.get("id")] = stem, [image.get("height"), image.get("width")]
-                found.setdefault(stem, [])
+                path = without_suffix(image["file_name"].replace("\\", "/"))
+                images[image.get("id")] = path, [image.get("height"), image.get("width")]
+                found.setdefault(path, [])
             for annotation in _annotations(content.get("annotations")):
                 image_id = annotation.get("image_id")
-                if isinstance(image_id, (int, str)) and image_id in stems:
-                    stem, size = stems[image_id]
-                    found[stem].append({**annotation, "size": size})
+                if isinstance(image_id, (int, str)) and image_id in images:
+                    path, size = images[image_id]
+                    found[path].append({**annotation, "size": size})
         return found
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.formats.poses import rigid
+from og_pointcloud.formats.poses import rigid, upright_axes
 from og_pointcloud.scene import Camera
 
 FOCAL = 1.7
@@ -55,10 +55,9 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
     target = low + (high - low) / 2
     distance = DISTANCE * max(float(np.linalg.norm(high - low)) / 2, 1e-9)
     # Candidates all around at two heights; side is any direction across up.
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    side /= np.linalg.norm(side)
+    side, across, _ = upright_axes(up)
     directions = [
-        np.cos(tilt) * (np.cos(turn) * side + np.sin(turn) * np.cross(up, side)) + np.sin(tilt) * up
+        np.cos(tilt) * (np.cos(turn) * side + np.sin(turn) * across) + np.sin(tilt) * up
         for tilt in np.deg2rad(ELEVATIONS_DEG)
         for turn in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     ]
