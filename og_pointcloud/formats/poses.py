@@ -191,7 +191,7 @@ def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
     # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
-    return np.stack([aside, np.cross(up, aside), up])
+    return np.asarray([aside, np.cross(up, aside), up], np.float64)
 
 
 def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:
