@@ -296,9 +296,12 @@ class Block(nn.Module):
         self.mlp = nn.Sequential(OrderedDict(**layers, c_proj=nn.Linear(4 * TEXT_WIDTH, TEXT_WIDTH)))
 
     def forward(self, x: torch.Tensor, later: torch.Tensor) -> torch.Tensor:
-        """x: (B, T, W); later: (T, T), -inf where a token may not look."""
-        normed = self.ln_1(x)
-        x = x + self.attn(normed, normed, normed, attn_mask=later, need_weights=False)[0]
+        """x: (B, T, W); later: (T, T), -inf where a token may not look. Attention as plain products: torch's own fixes
+        the number of texts when it is exported."""
+        inputs = F.linear(self.ln_1(x), self.attn.in_proj_weight, self.attn.in_proj_bias)
+        query, key, value = inputs.unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
+        cosines = query @ key.transpose(2, 3) * (TEXT_WIDTH / HEADS) ** -0.5 + later
+        x = x + self.attn.out_proj((cosines.softmax(3) @ value).transpose(1, 2).flatten(2))
         return x + self.mlp(self.ln_2(x))
 
 
@@ -316,25 +319,19 @@ class TextEncoder(nn.Module):
         self.text_projection = nn.Parameter(torch.randn(TEXT_WIDTH, WIDTH) * TEXT_WIDTH**-0.5)
         self.later = torch.full((CONTEXT, CONTEXT), -torch.inf).triu(1)
 
-    def forward(self, texts: Sequence[str]) -> torch.Tensor:
-        """(B, WIDTH) unit rows."""
+    def tokens(self, texts: Sequence[str]) -> torch.Tensor:
+        """(B, T) their ids; behind its end, the highest id, a text goes on with it."""
         rows = [self.tokenizer(text) for text in texts]
         length = max(map(len, rows))
-        # The end's id is the highest; behind the end nothing counts, since no token looks ahead.
-        return self.vectors(torch.tensor([row + row[-1:] * (length - len(row)) for row in rows]))
+        return torch.tensor([row + row[-1:] * (length - len(row)) for row in rows])
 
-    def vectors(self, ids: torch.Tensor) -> torch.Tensor:
-        """(B, WIDTH) unit rows of tokens (B, T)."""
-        length = ids.shape[1]
-        later = self.later[:length, :length]
-        x = self.token_embedding(ids) + self.positional_embedding[:length]
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        """(B, WIDTH) unit rows of tokens (B, T). What stands behind a text's end does not count: no token looks ahead."""
+        length = tokens.shape[1]
+        x = self.token_embedding(tokens) + self.positional_embedding[:length]
         for block in self.transformer["resblocks"]:  # type: ignore[union-attr]
-            x = block(x, later)
-        return self.pooled(x, ids)
-
-    def pooled(self, x: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
-        """(B, WIDTH) unit rows of what the last block gives (B, T, TEXT_WIDTH)."""
-        last = self.ln_final(x)[torch.arange(ids.shape[0]), ids.argmax(dim=1)]
+            x = block(x, self.later[:length, :length])
+        last = self.ln_final(x)[torch.arange(tokens.shape[0]), tokens.argmax(dim=1)]
         return F.normalize(last @ self.text_projection, dim=1)
 
 
@@ -373,7 +370,7 @@ def train(crops: Crops, words: Words, steps: int, seed: int) -> tuple[TextEncode
         images = F.normalize(image(_varied(crops.pixels[chosen], rng)).unflatten(0, (BATCH, -1)).mean(dim=1), dim=1)
         texts = [words.phrase(str(rng.choice(SYNONYMS[kind])), rng) for kind in KINDS for _ in range(PHRASES)]
         texts += [words.absent_phrase(rng) for _ in range(ABSENT)]
-        loss = contrastive_loss(images, torch.from_numpy(crops.kinds[chosen]), text(texts))
+        loss = contrastive_loss(images, torch.from_numpy(crops.kinds[chosen]), text(text.tokens(texts)))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -423,37 +420,13 @@ def _hue_turns(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 # Export ---------------------------------------------------------------------------------------------------------
 
 
-class TextTower(nn.Module):
-    """The text encoder as it is exported: from tokens on, its attention as plain products, since torch's own module
-    fixes the number of texts when it is exported."""
-
-    def __init__(self, text: TextEncoder) -> None:
-        super().__init__()
-        self.text = text
-
-    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        """(B, WIDTH) unit rows of tokens (B, T)."""
-        length = tokens.shape[1]
-        x = self.text.token_embedding(tokens) + self.text.positional_embedding[:length]
-        for block in self.text.transformer["resblocks"]:  # type: ignore[union-attr]
-            inputs = F.linear(block.ln_1(x), block.attn.in_proj_weight, block.attn.in_proj_bias)
-            query, key, value = inputs.unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
-            cosines = query @ key.transpose(2, 3) * (TEXT_WIDTH / HEADS) ** -0.5 + self.text.later[:length, :length]
-            x = x + block.attn.out_proj((cosines.softmax(3) @ value).transpose(1, 2).flatten(2))
-            x = x + block.mlp(block.ln_2(x))
-        return self.text.pooled(x, tokens)
-
-
 def export(text: TextEncoder, image: ImageEncoder, words: Words, folder: Path) -> None:
     """Write both halves."""
     about = {
         "feature_space": DEMO_SPACE, "context_length": CONTEXT, "vocabulary": text.tokenizer.highest_id + 1,
         "pad_id": None, "templates": ["{}"], "tower": {"layers": 1, "heads": HEADS, "activation": "gelu"},
     }  # fmt: skip
-    tower, some = TextTower(text).eval(), torch.tensor([text.tokenizer("an old chair")])
-    with torch.no_grad():
-        torch.testing.assert_close(tower(some), text.vectors(some))
-    write_text_encoder(folder / "text", tower, tokenizer_json(words.merges), about)
+    write_text_encoder(folder / "text", text, tokenizer_json(words.merges), about)
     rounded = RoundedImageModel(image)
     about = {"knows": list(KINDS), "trained_by": "scripts/train_demo_encoder.py"}
     write_image_encoder(folder / "image", rounded, rounded.graph(), about)
