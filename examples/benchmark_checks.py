@@ -42,6 +42,7 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 ROUNDS = 2
 CURED = 3
 """Percent of mIoU below that of the right capture up to which a repair has cured a fault."""
+TEXT, FEATURES = "text_features.npz", "mask_features.npz"
 Fault = Callable[[Path], None]
 Maps = list[NDArray[Any]]
 
@@ -126,7 +127,7 @@ def judged(folder: Path, repairs: tuple[str, ...] | list[str], fitted: bool) -> 
     doubts = [check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt"]
     doubts += ["words"] if check_words(cloud).verdict == "doubt" else []
     truth = read_truth(folder)
-    return 100 * score_capture(ask(cloud, truth, folder / "text_features.npz"), truth).labels.miou, doubts
+    return 100 * score_capture(ask(cloud, truth, folder / TEXT), truth).labels.miou, doubts
 
 
 def with_words(cloud: LabelledCloud, folder: Path) -> LabelledCloud:
@@ -236,26 +237,24 @@ def pictures(part: str, change: Callable[[Maps, int], NDArray[Any]]) -> Fault:
     return fault
 
 
-def features(change: Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]) -> Fault:
-    """A fault of the mask features; change: of the rows of an image."""
+def arrays(name: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Fault:
+    """A fault of text_features.npz or mask_features.npz; change: of all that it holds."""
 
     def fault(folder: Path) -> None:
-        random, path = np.random.default_rng(0), own(folder, "mask_features.npz")
-        arrays: dict[str, Any] = {key: np.asarray(value) for key, value in np.load(path).items()}
-        arrays |= {key: change(rows, random) for key, rows in arrays.items() if rows.ndim == 2}
-        np.savez(path, **arrays)
-
-    return fault
-
-
-def text(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Fault:
-    """A fault of text_features.npz."""
-
-    def fault(folder: Path) -> None:
-        path = own(folder, "text_features.npz")
+        path = own(folder, name)
         np.savez(path, **change(dict(np.load(path))))
 
     return fault
+
+
+def features(change: Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]) -> Fault:
+    """A fault of the mask features; change: of the rows of an image."""
+
+    def of_all(rows: dict[str, Any]) -> dict[str, Any]:
+        random = np.random.default_rng(0)
+        return {key: change(each, random) if each.ndim == 2 else each for key, each in rows.items()}
+
+    return arrays(FEATURES, of_all)
 
 
 def together(*faults: Fault) -> Fault:
@@ -268,20 +267,10 @@ def together(*faults: Fault) -> Fault:
     return fault
 
 
-def masks_of_next_image(folder: Path) -> None:
-    """Masks and their features of the next image."""
-    pictures("masks", lambda maps, index: maps[(index + 1) % len(maps)])(folder)
-    path = own(folder, "mask_features.npz")
-    rows = dict(np.load(path))
-    stems = [file.stem for file in sorted((folder / "masks").iterdir())]
-    shifted = {stem: rows[stems[(index + 1) % len(stems)]] for index, stem in enumerate(stems)}
-    np.savez(path, **{**rows, **shifted})
-
-
-def without_space(folder: Path) -> None:
-    """Mask features whose encoder nobody named."""
-    path = own(folder, "mask_features.npz")
-    np.savez(path, **{key: rows for key, rows in np.load(path).items() if key != "feature_space"})
+def of_next_image(rows: dict[str, Any]) -> dict[str, Any]:
+    """Each image's features from the next."""
+    stems = sorted(key for key, each in rows.items() if each.ndim == 2)
+    return rows | {stem: rows[after] for stem, after in zip(stems, [*stems[1:], *stems[:1]], strict=True)}
 
 
 def colmap(inverse: bool = False, size: float = 1, scale: float = 1, wxyz: bool = True) -> Fault:
@@ -381,7 +370,9 @@ FAULTS: dict[str, Fault] = {
     "masks mirrored": pictures("masks", lambda maps, i: maps[i][:, ::-1]),
     "masks turned by 90": pictures("masks", lambda maps, i: np.rot90(maps[i])),
     "masks square": pictures("masks", lambda maps, i: cv2.resize(maps[i], (256, 256), interpolation=cv2.INTER_NEAREST)),
-    "masks of next image": masks_of_next_image,
+    "masks of next image": together(
+        pictures("masks", lambda maps, i: maps[(i + 1) % len(maps)]), arrays(FEATURES, of_next_image)
+    ),
     "ids from 0": pictures("masks", lambda maps, i: np.maximum(maps[i], 1) - 1),
     "features shuffled": features(lambda rows, random: rows[random.permutation(len(rows))]),
     "too many features": features(lambda rows, random: np.concatenate([rows, rows])),
@@ -397,11 +388,12 @@ FAULTS: dict[str, Fault] = {
     ),
     "masks RGBA": pictures("masks", lambda maps, i: cv2.merge([maps[i].astype(np.uint8)] * 4)),
     "masks inverted": pictures("masks", lambda maps, i: (maps[i] == 0).astype(np.uint16)),
-    "text of other encoder": text(lambda words: {**words, "vectors": mixed(words["vectors"])}),
+    "text of other encoder": arrays(TEXT, lambda words: {**words, "vectors": mixed(words["vectors"])}),
     "the same, unnamed": together(
-        text(lambda words: {"names": words["names"], "vectors": mixed(words["vectors"])}), without_space
+        arrays(TEXT, lambda words: {"names": words["names"], "vectors": mixed(words["vectors"])}),
+        arrays(FEATURES, lambda rows: {key: each for key, each in rows.items() if key != "feature_space"}),
     ),
-    "text rows shifted": text(lambda words: {**words, "vectors": np.roll(words["vectors"], 1, 0)}),
+    "text rows shifted": arrays(TEXT, lambda words: {**words, "vectors": np.roll(words["vectors"], 1, 0)}),
     "photographs of noise": pictures(
         "images", lambda maps, i: np.random.default_rng(1).integers(0, 255, maps[i].shape).astype(np.uint8)
     ),

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from og_pointcloud_room.capture import CaptureSettings, make_capture
-from og_pointcloud_room.raycast import Frame, Intrinsics
 
 from og_pointcloud.formats.depth import DepthFile, DepthFrame
 from og_pointcloud.formats.fusion import doubtful_depth
@@ -58,7 +57,7 @@ def main(seeds: list[int]) -> None:
     for seed in seeds:
         made = make_capture(seed, CaptureSettings(views=24, width=320, height=240, samples_per_view=20_000))
         depth = np.stack([np.where(frame.depth_m < FARTHEST_M, frame.depth_m, 0) for frame in made.frames])
-        cameras = [camera_of(frame, made.intrinsics) for frame in made.frames]
+        cameras = [made.intrinsics.camera(frame.camera_to_world) for frame in made.frames]
         print(f"demo room {seed}")
         for name, fault in DEPTH.items():
             print(f"{name:22}{said_of(fault(depth, cameras[0]), cameras)}")
@@ -75,12 +74,6 @@ def said_of(depth: Depth, cameras: list[Camera]) -> str:
             np.save(path, image.astype(np.float32))
             frames.append(DepthFrame(path.stem, DepthFile(path, camera, 1.0)))
         return doubtful_depth(frames) or "-"
-
-
-def camera_of(frame: Frame, lens: Intrinsics) -> Camera:
-    """The camera of a frame of the room."""
-    pose = np.linalg.inv(frame.camera_to_world).astype(np.float64)
-    return Camera(lens.width, lens.height, lens.focal_px, lens.focal_px, lens.width / 2, lens.height / 2, pose)
 
 
 def ray_lengths(camera: Camera) -> Depth:

@@ -136,13 +136,12 @@ def faces_of(cameras: Sequence[Photographer], lens: Lens) -> list[Photographer]:
 
 def lenses(capture: RoomCapture, every: int) -> dict[str, list[Photographer]]:
     """The cameras of each row; every: from how many places there is one panorama."""
-    places, fx = [frame.camera_to_world for frame in capture.frames], capture.intrinsics.focal_px
-    width, height = capture.intrinsics.width, capture.intrinsics.height
+    places = [frame.camera_to_world for frame in capture.frames]
     equidistant = lens_of("fisheye", {})
     assert equidistant is not None
     fisheyes, panoramas = [fisheye(pose) for pose in places], [panorama(pose) for pose in places[::every]]
     return {
-        "pinhole": [pinhole(Camera(width, height, fx, fx, width / 2, height / 2, _inverse(at))) for at in places],
+        "pinhole": [pinhole(capture.intrinsics.camera(at)) for at in places],
         "fisheye": fisheyes,
         "its faces": faces_of(fisheyes, equidistant),
         "spherical": panoramas,

@@ -30,8 +30,8 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.evaluate.intervals import bootstrap
 from og_pointcloud.evaluate.knobs import changed
 from og_pointcloud.evaluate.sweep import Subject, read_subject
-from og_pointcloud.fitting.fit import Prepared, prepare
-from og_pointcloud.fitting.labellers import Labelling, fast, leaves_of_training, trained_by_rendering
+from og_pointcloud.fitting.fit import Prepared, labelled_cloud, prepare
+from og_pointcloud.fitting.labellers import fast, leaves_of_training, trained_by_rendering
 from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook
 from og_pointcloud.fitting.learned.rendered_views import RenderedViews
 from og_pointcloud.formats.atomic import write_file
@@ -190,7 +190,7 @@ class Trial:
         else:
             found = fast(prepared.table, prepared.surface, settings, Journal(False))
         seconds += time.process_time() - start
-        miou, unknown = self.score(found, prepared)
+        miou, unknown = self.score(labelled_cloud(prepared, found, settings, Journal(False)))
         return Measured(
             self.subject.name, key_of(changes), seed, miou, unknown, len(found.instances), round(seconds, 2)
         )
@@ -215,24 +215,13 @@ class Trial:
             self.trained[key] = surface, features, book, time.process_time() - start
         return self.trained[key]
 
-    def score(self, labelling: Labelling, prepared: Prepared) -> tuple[float, float]:
+    def score(self, cloud: LabelledCloud) -> tuple[float, float]:
         """mIoU and the share of unknown points."""
-        subject, points = self.subject, self.subject.scene.points
-        assert subject.vocabulary is not None
-        assert subject.truth is not None
-        spacing = float(np.median(prepared.surface.neighbourhood.spacing))
-        labelling = labelling.of_points(prepared.surface.row_of_point)
-        cloud = LabelledCloud(
-            xyz=points.xyz,
-            origin=points.origin,
-            instance_ids=labelling.instance_ids,
-            instances=labelling.instances,
-            feature_space=subject.scene.feature_space,
-            spacing=spacing,
-            reach=3 * spacing,
-        )
-        words = LabelledScene.from_cloud(cloud).chooser.choose(subject.vocabulary.vectors).at(cloud.instance_ids)[0]
-        score = subject.truth.score(subject.truth.class_of(words, subject.vocabulary.names))
+        words, truth = self.subject.vocabulary, self.subject.truth
+        assert words is not None
+        assert truth is not None
+        labels = LabelledScene.from_cloud(cloud).chooser.choose(words.vectors).at(cloud.instance_ids)[0]
+        score = truth.score(truth.class_of(labels, words.names))
         return round(score.miou, 4), round(score.unknown_share, 4)
 
 

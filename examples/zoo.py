@@ -20,10 +20,11 @@ from pathlib import Path
 from og_pointcloud_zoo.constants import constants, page, tried
 from og_pointcloud_zoo.draws import draw, half_of, scene_names
 from og_pointcloud_zoo.make import made_scene
-from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings, warm_up
+from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings
 from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.evaluate.sweep import warm_up
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
 

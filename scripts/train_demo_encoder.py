@@ -326,7 +326,7 @@ class TextEncoder(nn.Module):
         return torch.tensor([row + row[-1:] * (length - len(row)) for row in rows])
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        """(B, WIDTH) unit rows of tokens (B, T). What stands behind a text's end does not count: no token looks ahead."""
+        """(B, WIDTH) unit rows of tokens (B, T). What stands behind a text's end does not count: none looks ahead."""
         length = tokens.shape[1]
         x = self.token_embedding(tokens) + self.positional_embedding[:length]
         for block in self.transformer["resblocks"]:  # type: ignore[union-attr]

@@ -135,14 +135,9 @@ def test_hardly_any_points(count: int) -> None:
     np.testing.assert_array_equal(centers[own], values)
 
 
-def test_bad_input_is_refused() -> None:
-    values, weight = np.zeros((4, 3), np.float32), np.ones(4)
-    with pytest.raises(OgPointcloudError, match="0 centers"):
-        kmeans(values, weight, np.zeros((0, 3)), 5)
-    with pytest.raises(OgPointcloudError, match="do not fit"):
-        kmeans(values, weight, np.zeros((2, 4)), 5)
-    with pytest.raises(OgPointcloudError, match="finite"):
-        kmeans(np.full((4, 3), np.nan, np.float32), weight, np.zeros((2, 3)), 5)
+def test_values_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(OgPointcloudError, match="row 2 of a codebook's input is"):
+        kmeans(np.array([[1], [2], [np.nan]], np.float32), np.ones(3), np.zeros((2, 1)), 5)
 
 
 def test_seeds_lie_in_different_places() -> None:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import zoom
 
 from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.scene import Camera
 from og_pointcloud_room.furniture import Item
 from og_pointcloud_room.room import Room
 from og_pointcloud_room.shapes import rotated
@@ -101,6 +102,11 @@ class Intrinsics:
         x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal_px
         y = (np.arange(self.height) + 0.5 - self.height / 2) / self.focal_px
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).astype(np.float64)
+
+    def camera(self, camera_to_world: Points) -> Camera:
+        """This camera at a pose (4, 4), OpenCV axes."""
+        pose, focal = np.linalg.inv(camera_to_world).astype(np.float64), self.focal_px
+        return Camera(self.width, self.height, focal, focal, self.width / 2, self.height / 2, pose)
 
 
 @dataclass(frozen=True)

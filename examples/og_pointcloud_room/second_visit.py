@@ -67,11 +67,7 @@ class TwoDays:
             ids = propose_masks(seen.owner, noise, rng)
             rows = mask_features(ids, seen.owner, kinds, looks, self.model, noise.wrong_class, rng)
             depth = seen.depth_m + 0.003 * rng.normal(size=seen.depth_m.shape).astype(np.float32)
-            width, height, focal_px = INTRINSICS.width, INTRINSICS.height, INTRINSICS.focal_px
-            camera = og.Camera(
-                width, height, focal_px, focal_px, width / 2, height / 2, np.linalg.inv(pose).astype(np.float64)
-            )
-            masks = ids.astype(np.int32) - 1
+            camera, masks = INTRINSICS.camera(pose), ids.astype(np.int32) - 1
             made.append(og.Frame(camera, masks, rows, depth, rgb=seen.image, stamp=stamp + number / 3))
         return made
 

@@ -127,13 +127,6 @@ def _beside_baselines(
     return replace(row, baseline=best[1], baseline_miou=best[0], gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
 
 
-def warm_up(scene: Scene) -> None:
-    """Fit six views of a few points, so that no scene's seconds hold the loading of compiled code."""
-    few = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // 2_000))
-    with suppress(OgPointcloudError):
-        og.fit(replace(scene, points=few, views=scene.views[:6]), progress=False)
-
-
 def parsed_settings(changes: Iterable[str]) -> FitSettings:
     """Settings with numbers changed by ``path=value``, as "membership.sure_share=0.5" or "mode=grouping"."""
     found = FitSettings()

@@ -179,7 +179,9 @@ class _Trial:
     def row(self, setting: Setting) -> Row:
         """The row of one setting."""
         scene = replace(self.subject.scene, views=self.subject.scene.views[:: setting.every])
-        self._warm_up(setting.settings)
+        if setting.settings.mode not in self.warm:
+            self.warm.add(setting.settings.mode)
+            warm_up(self.subject.scene, setting.settings)
         start = time.perf_counter()
         cloud = fit(scene, setting.settings, progress=False)
         seconds = time.perf_counter() - start
@@ -220,16 +222,13 @@ class _Trial:
             figures |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
         return figures
 
-    def _warm_up(self, settings: FitSettings) -> None:
-        """Fit two views of a few points in this mode: what they are labelled does not matter."""
-        if settings.mode in self.warm:
-            return
-        self.warm.add(settings.mode)
-        scene = self.subject.scene
-        points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
-        views = tuple(view for view in scene.views if view.mask_count)[:2]
-        with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
-            fit(replace(scene, points=points, views=views), settings, progress=False)
+
+def warm_up(scene: Scene, settings: FitSettings | None = None) -> None:
+    """Fit two views of a few points, so that no seconds hold the loading of compiled code."""
+    points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
+    views = tuple(view for view in scene.views if view.mask_count)[:2]
+    with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
+        fit(replace(scene, points=points, views=views), settings, progress=False)
 
 
 def front(rows: Sequence[Row]) -> list[Row]:

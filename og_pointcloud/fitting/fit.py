@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -83,7 +84,7 @@ def fit(
         if needs_tiles(scene, settings):
             _check(scene, journal)
             labelling, spacing = fit_tiles(scene, settings, kept, journal, executor)
-            cloud = _labelled_cloud(scene, labelling, spacing, settings, journal)
+            cloud = _cloud_of(scene, labelling, spacing, settings, journal)
         else:
             prepared = prepare(scene, settings, journal, kept)
             # A temporary folder goes with the run: checkpoints in it would serve nobody.
@@ -118,10 +119,8 @@ def prepare(
     journal = journal or Journal(progress=False)
     _check(scene, journal)
     surface = _with_best_scale(reconstruct_surface(scene, settings, journal), settings, journal)
-    if work is None:
-        with WorkFolder.open(None) as temporary:
-            return Prepared(scene, surface, _mask_table(surface, settings, journal, temporary))
-    return Prepared(scene, surface, _mask_table(surface, settings, journal, work))
+    with WorkFolder.open(None) if work is None else nullcontext(work) as kept:
+        return Prepared(scene, surface, _mask_table(surface, settings, journal, kept))
 
 
 def fit_prepared(
@@ -136,14 +135,17 @@ def fit_prepared(
     """
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
-    surface = prepared.surface
     labeller = partial(paper, work=work) if settings.mode == "paper" else LABELLERS[settings.mode]
-    labelling = labeller(prepared.table, surface, settings, journal)
-    labelling = _with_reliability(labelling, prepared, settings, journal)
-    spacing = float(np.median(surface.neighbourhood.spacing))
-    # Labels are of the surface's points; points at the same place were left out of it and get the same label.
-    labelling = labelling.of_points(surface.row_of_point)
-    return _labelled_cloud(prepared.scene, labelling, spacing, settings, journal)
+    labelling = labeller(prepared.table, prepared.surface, settings, journal)
+    return labelled_cloud(prepared, _with_reliability(labelling, prepared, settings, journal), settings, journal)
+
+
+def labelled_cloud(prepared: Prepared, labelling: Labelling, settings: FitSettings, journal: Journal) -> LabelledCloud:
+    """The scene's points with a labelling of the surface's."""
+    spacing = float(np.median(prepared.surface.neighbourhood.spacing))
+    # Points at the same place were left out of the surface, and get the same label.
+    labelling = labelling.of_points(prepared.surface.row_of_point)
+    return _cloud_of(prepared.scene, labelling, spacing, settings, journal)
 
 
 def _with_reliability(labelling: Labelling, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
@@ -234,7 +236,7 @@ def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, jo
     return table
 
 
-def _labelled_cloud(
+def _cloud_of(
     scene: Scene, labelling: Labelling, spacing: float, settings: FitSettings, journal: Journal
 ) -> LabelledCloud:
     """The scene's points with their labels, and how they came about; a warning where there is no instance."""

@@ -43,7 +43,7 @@ def parse_memory(text: str) -> int:
 
 def free_memory() -> int:
     """Bytes that this process could still take: what the machine has free, or what its container leaves it."""
-    free = [_meminfo()]
+    free = [_available()]
     for limit, used in CGROUPS:
         try:
             free.append(max(0, int(Path(limit).read_text()) - int(Path(used).read_text())))
@@ -52,16 +52,23 @@ def free_memory() -> int:
     return min(free)
 
 
-def _meminfo() -> int:
+def _available() -> int:
     """Bytes that the machine could give without swapping, as far as the system tells."""
+    if available := _told_by_linux("/proc/meminfo", "MemAvailable:"):
+        return available
+    try:  # no Linux: count on most of what is built in
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4
+    except (AttributeError, ValueError, OSError):  # Windows: a cautious guess
+        return 4 * 10**9
+
+
+def _told_by_linux(file: str, entry: str) -> int:
+    """Bytes that a line of a file under /proc says; 0 where there is none."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):  # no Linux: count on most of what is built in
-        try:
-            return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4
-        except (AttributeError, ValueError, OSError):  # Windows: a cautious guess
-            return 4 * 10**9
+        lines = Path(file).read_text().splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(entry)), 0)
 
 
 def memory_in_use() -> int:
@@ -74,11 +81,7 @@ def memory_in_use() -> int:
 
 def peak_memory() -> int:
     """The most memory that this process has held, in bytes; 0 where the system does not tell."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    except (OSError, StopIteration):
-        return 0
+    return _told_by_linux("/proc/self/status", "VmHWM:")
 
 
 def memory_left(limit: int | None) -> int:
