@@ -38,6 +38,10 @@ class LeftOut(Enum):
         "images of at most {most:,} pixels are rendered: one row and column in {stride} is enough",
     )
     RENDERING = "rendering", "rendering of {count} views", "an interrupted fit kept them in '{folder}'"
+    VIEWS = (
+        "views", "{count} of {total} views",
+        "nearly all that each of them shows is shown by {enough} of the others",
+    )
     FINE_POINTS = (
         "points finer than pixels", "{share:.0%} of the points in the images",
         "closer together than {finest_px:g} px, or more than {most:,} in one: larger ones stand in",

@@ -59,7 +59,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "grouping.container_share", "grouping.join_majority",
     ),
     "enough": (
-        "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
+        "geometry.enough_views", "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
     ),
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",

@@ -42,6 +42,7 @@ from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import chance_of_place, isotropic, near_plane, neighbourhood, sample_of_points
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
 from og_pointcloud.rendering.surface import surface_thickness, with_distinct_points
@@ -108,6 +109,7 @@ def fit_tiles(
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
     scene, row_of_point = with_distinct_points(scene, journal)
+    scene = with_needed_views(scene, settings.geometry.enough_views, journal)
     count, run = len(scene.points), partial(run_tasks, executor, journal)
     most = settings.tile_points or _points_per_tile(count, _memory(count, settings, executor))
     with journal.stage("spacing"):

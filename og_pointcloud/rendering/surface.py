@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
     Neighbourhood,
     along_curve,
@@ -62,6 +63,8 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     scene, row_of_point = with_distinct_points(scene, journal)
     with journal.stage("spacing"):
         scene, row_of_point = _in_order_of_place(scene, row_of_point)
+        if settings.mode != "paper":  # which has a choice of its own: so many steps, a view each
+            scene = with_needed_views(scene, settings.geometry.enough_views, journal)
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):

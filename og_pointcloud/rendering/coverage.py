@@ -1,0 +1,84 @@
+"""Which views a fit needs: where views enough see the same points, further ones say little and cost as much.
+
+A wide lens shows the whole room from each place, a video shows it again with every frame. Of a sample of the points it
+is asked which ones each view sees: those in its image that do not lie behind others. Then views are left out one after
+the other, as long as nearly all that each of them sees is seen by enough of the views that stay.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.rendering.geometry import sample_of_points
+from og_pointcloud.rendering.splatting import seen_from
+from og_pointcloud.scene import Camera, Scene
+
+SAMPLE = 8000
+"""Points that stand for all."""
+FEW = 0.05
+"""Share of what a view sees that may be seen by fewer others: there is nearly always something at its border."""
+CELL_POINTS = 4
+"""Points in a cell of a view's image, on average: of so few, one lies on the surface in front."""
+BEHIND = 1.3
+"""A point deeper than this times the nearest of its cell is hidden: a slanted surface goes nearly as deep in a cell."""
+
+
+def with_needed_views(scene: Scene, enough: int, journal: Journal) -> Scene:
+    """The scene without views that it does not need; which ones, their names decide, not their order."""
+    chance = [zlib.crc32(view.name.encode()) for view in scene.views]
+    xyz = scene.points.xyz[sample_of_points(scene.points.xyz, SAMPLE)]
+    needed = needed_views(seen_points(xyz, [view.camera for view in scene.views]), np.argsort(chance), enough)
+    if needed.all():
+        return scene
+    journal.leave_out(LeftOut.VIEWS, count=int((~needed).sum()), total=len(needed), enough=enough)
+    return replace(scene, views=tuple(view for view, stays in zip(scene.views, needed, strict=True) if stays))
+
+
+def needed_views(seen: NDArray[np.bool_], order: NDArray[np.integer], enough: int) -> NDArray[np.bool_]:
+    """(views,) bool, False for views that may be left out together. seen: (views, points). order: in which views are
+    asked whether they may."""
+    needed, count = np.ones(len(seen), np.bool_), seen.sum(axis=0)
+    for view in order:
+        points = seen[view]
+        if np.count_nonzero(count[points] <= enough) < FEW * np.count_nonzero(points):
+            needed[view] = False
+            count -= points
+    return needed
+
+
+def seen_points(xyz: NDArray[np.float32], cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """(cameras, n) bool: the points (n, 3) in each image that are not hidden. Each is asked in its cell of the image,
+    where the nearest point hides what lies far behind it."""
+    seen = np.zeros((len(cameras), len(xyz)), np.bool_)
+    poses = np.stack([camera.world_to_camera for camera in cameras])
+    numbers = np.array([(*camera.intrinsics, camera.width, camera.height) for camera in cameras])
+    _mark_seen(xyz.astype(np.float64), poses, numbers, seen)
+    return seen
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _mark_seen(xyz, poses, numbers, seen):  # noqa: ANN001, ANN202
+    for view in prange(len(poses)):
+        fx, fy, cx, cy, width, height = numbers[view]
+        inside, place, count = np.empty(len(xyz), np.int32), np.empty((len(xyz), 3)), 0  # column, row, depth
+        for g in range(len(xyz)):
+            depth, across, down = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], poses[view])
+            column, row = fx * across + cx, fy * down + cy
+            if depth > 0 and 0 <= column < width and 0 <= row < height:
+                inside[count] = g
+                place[count] = column, row, depth
+                count += 1
+        side = np.sqrt(width * height * CELL_POINTS / max(count, 1))
+        front = np.full((int(height / side) + 1, int(width / side) + 1), np.inf)
+        for k in range(count):
+            cell = int(place[k, 1] / side), int(place[k, 0] / side)
+            front[cell] = min(front[cell], place[k, 2])
+        for k in range(count):
+            seen[view, inside[k]] = place[k, 2] <= BEHIND * front[int(place[k, 1] / side), int(place[k, 0] / side)]
