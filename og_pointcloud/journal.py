@@ -23,7 +23,7 @@ class LeftOut(Enum):
     CHOICE_OF_SPLATS = "choice of splats", "choice of scale and opacity", "the file holds Gaussians"
     CHOICE_OF_SCALE = (
         "choice of scale", "choice of the points' size",
-        "no views can judge others here: points are drawn {scale:g} spacings large",
+        "too few views can judge others here: points are drawn {scale:g} spacings large",
     )
     CHOICE_IN_PAPER_MODE = (
         "choice of splats, mode paper", "choice of scale and opacity",

@@ -103,9 +103,9 @@ def test_masks_are_read_once_for_all_sizes_where_memory_allows(scene: Scene, mon
 
 
 def test_too_few_views_to_hold_some_out(scene: Scene) -> None:
-    choice = chosen(replace(scene, views=scene.views[:3]))
+    choice = chosen(replace(scene, views=scene.views[:7]))
     assert (choice.scale, choice.agreements) == (FitSettings().geometry.middle_scale, {})
-    cloud = og.fit(replace(scene, views=scene.views[:3]), progress=False)
+    cloud = og.fit(replace(scene, views=scene.views[:7]), progress=False)
     assert any(entry["key"] == "choice of scale" for entry in cloud.provenance["left_out"])
 
 

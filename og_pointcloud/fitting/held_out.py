@@ -30,8 +30,8 @@ from og_pointcloud.settings import FitSettings
 
 MAPS_SHARE = 0.05
 """Of the memory that a fit has left, mask maps may take so much: then they are read once, not for each size anew."""
-FEWEST_VIEWS = 4
-"""Views needed: of fewer, a half has one view, which nothing in it contradicts."""
+FEWEST_VIEWS = 8
+"""Views needed: with fewer, the labels of a half are so poor that choosing by them is no better than the middle."""
 STEP = 1.4
 """From a size to the next one beyond the settings' own, which are as far apart."""
 CLEARLY = 0.005

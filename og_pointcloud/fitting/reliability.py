@@ -27,7 +27,6 @@ from scipy.sparse import csr_array, vstack
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.grouping import indicator
-from og_pointcloud.fitting.held_out import FEWEST_VIEWS
 from og_pointcloud.fitting.labellers import Labelling, grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
@@ -35,6 +34,8 @@ from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
+FEWEST_VIEWS = 4
+"""Views needed: of fewer, a half has one view, which nothing in it contradicts."""
 SAME_LOOK = 0.5
 """Two instances are of one look from this cosine of their descriptors on, taken without what all masks share. Unrelated
 things have about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
