@@ -240,10 +240,12 @@ def huge_image(kind: str, width: int = 60_000, height: int = 17_000) -> bytes:
         sizes = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
         return b"RIFF" + bytes(4) + b"WEBPVP8X" + struct.pack("<II", 10, 0) + sizes
     if kind == "tif":
-        entries = struct.pack("<HHHIIHHII", 2, 256, 4, 1, width, 257, 4, 1, height)
-        return b"II*\0" + struct.pack("<I", 8) + entries
-    header = struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + header + bytes(4)
+        # Width, height, bits, no compression, black is 0, where the one strip is, rows in it, its bytes.
+        tags = {256: width, 257: height, 258: 8, 259: 1, 262: 1, 273: 8, 278: height, 279: width}
+        entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+        return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4)
+    header = b"IHDR" + struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">II", zlib.crc32(header), 9) + b"IDAT"
 
 
 def transforms(**changes: Any) -> bytes:

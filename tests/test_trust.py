@@ -218,7 +218,7 @@ def test_sizes_come_from_headers_and_are_bounded(tmp_path, kind):
     assert image_size(small) == (57, 31)
     large.write_bytes(huge_image(kind))
     for read in (image_size, lambda file: read_rgb(file, (60_000, 17_000))):
-        with pytest.raises(SceneError, match=r"60000x17000 pixels; expected at most .*: scale it down"):
+        with pytest.raises(SceneError, match=r"(60000x17000|1020000000) pixels.*; expected at most .*: scale it down"):
             read(large)
 
 

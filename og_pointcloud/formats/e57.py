@@ -243,7 +243,7 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
         raise SceneError(f"it spans {turn:.0f} x {rise:.0f} degrees; expected 360 across, and 180 at most")
     cv2 = require_cv2()
     pixels = None
-    if stated_size(io.BytesIO(data)) == size:  # a small file may unpack to gigabytes
+    if stated_size(io.BytesIO(data), "its image") == size:  # a small file may unpack to gigabytes
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import posixpath
-import struct
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import BinaryIO, NamedTuple
@@ -20,8 +19,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".t
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
-MOST_SEGMENTS = 1000
-"""Segments of a JPEG among which its size must stand."""
 
 
 class PngHeader(NamedTuple):
@@ -86,88 +83,42 @@ def png_header(file: Path) -> PngHeader | None:
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) of an image file, as its header states it. SceneError beyond MAX_PIXELS."""
     with file.open("rb") as stream:
-        size = stated_size(stream)
+        size = stated_size(stream, file)
     if size is None:  # of a kind that is not known here
         height, width = decoded(file, require_cv2().IMREAD_GRAYSCALE).shape[:2]
         return width, height
-    _check_pixels(file, *size)
     return size
 
 
-def _check_pixels(file: Path, width: int, height: int) -> None:
+def _check_pixels(name: Path | str, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise SceneError(
-            f"{file} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels: scale it down"
+            f"{name} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels: scale it down"
         )
 
 
-def stated_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """(width, height) as a PNG, JPEG, BMP, WebP or TIFF states it; None where the file is no such image."""
-    head = stream.read(30)
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    if head[:2] == b"\xff\xd8":
-        return _jpeg_size(stream)
-    if head[:2] == b"BM" and len(head) >= 26:
-        width, height = struct.unpack_from("<ii", head, 18)
-        return abs(width), abs(height)  # rows from the top have a negative height
-    if head[:4] == b"RIFF" and head[8:12] == b"WEBP" and len(head) == 30:
-        return _webp_size(head)
-    return _tiff_size(stream, head) if head[:4] in (b"II*\0", b"MM\0*") else None
+def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
+    """(width, height) as the header of a PNG, JPEG, BMP, WebP or TIFF states it; None where there is no such header.
 
-
-def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """The size in the first frame header. Segments before it are skipped by their lengths (ITU-T T.81, B.1)."""
-    stream.seek(2)
-    for _ in range(MOST_SEGMENTS):
-        marker = stream.read(4)
-        while marker[:2] == b"\xff\xff":  # any number may stand before a marker
-            marker = marker[1:] + stream.read(1)
-        if len(marker) < 4 or marker[0] != 0xFF:
-            return None
-        # Frame headers, SOF0 to SOF15; C4, C8 and CC in between are tables (DHT, DAC) and reserved (JPG).
-        if marker[1] in range(0xC0, 0xD0) and marker[1] not in (0xC4, 0xC8, 0xCC):
-            frame = stream.read(5)  # precision, height, width
-            return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
-        stream.seek(int.from_bytes(marker[2:], "big") - 2, os.SEEK_CUR)
-    return None
-
-
-def _webp_size(head: bytes) -> tuple[int, int] | None:
-    """The size in a lossy (VP8, RFC 6386 9.1), lossless (VP8L) or extended (VP8X, RFC 9649) file."""
-    if head[12:16] == b"VP8 ":  # 14 bits each; the upper two scale the display
-        width, height = struct.unpack_from("<HH", head, 26)
-        return width & 0x3FFF, height & 0x3FFF
-    if head[12:16] == b"VP8L":  # 14 bits each, less one
-        bits = int.from_bytes(head[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    # 24 bits each, less one.
-    sizes = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
-    return sizes if head[12:16] == b"VP8X" else None
-
-
-def _tiff_size(stream: BinaryIO, head: bytes) -> tuple[int, int] | None:
-    """Tags 256 and 257 of the first directory (TIFF 6.0, section 2)."""
-    order = "<" if head[:2] == b"II" else ">"
-    if len(head) < 8:
+    No pixel is decoded. SceneError, which begins with ``name``, beyond MAX_PIXELS.
+    """
+    pillow = require_pillow()
+    try:
+        with pillow.open(stream, formats=("PNG", "JPEG", "BMP", "WEBP", "TIFF")) as image:
+            width, height = image.size
+    except pillow.DecompressionBombError as error:  # beyond a bound of Pillow's own
+        raise SceneError(f"{name}: {error}; expected at most {MAX_PIXELS} pixels: scale it down") from None
+    except Exception:  # of many kinds, whatever a damaged header leads its readers to
         return None
-    stream.seek(struct.unpack_from(order + "I", head, 4)[0])
-    count = int.from_bytes(stream.read(2), "little" if order == "<" else "big")
-    entries = stream.read(12 * count)
-    size: dict[int, int] = {}
-    for at in range(0, len(entries) - 11, 12):
-        tag, kind = struct.unpack_from(order + "HH", entries, at)
-        size[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), entries, at + 8)[0]  # 3: SHORT, else LONG
-    return (size[256], size[257]) if {256, 257} <= size.keys() else None
+    _check_pixels(name, width, height)
+    return width, height
 
 
 def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
-    # Before OpenCV takes memory for the pixels.
-    if stated := stated_size(io.BytesIO(data.tobytes())):
-        _check_pixels(file, *stated)
+    stated_size(io.BytesIO(data.tobytes()), file)  # which refuses too many pixels before OpenCV takes memory for them
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except cv2.error:
