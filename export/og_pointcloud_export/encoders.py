@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 import warnings
 import zlib
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, naming_extra
-from og_pointcloud.formats.atomic import replacing_folder
+from og_pointcloud.formats.atomic import StrPath, replacing_folder
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.masking import encode
@@ -64,8 +63,8 @@ MOST_PATCHES = 1 << 10
 
 
 def export_text_encoder(
-    source: str | os.PathLike[str],
-    output: str | os.PathLike[str] | None = None,
+    source: StrPath,
+    output: StrPath | None = None,
     *,
     feature_space: str | None = None,
     templates: Sequence[str] = ("{}",),
@@ -123,8 +122,8 @@ def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], abou
 
 
 def export_image_encoder(
-    source: str | os.PathLike[str],
-    output: str | os.PathLike[str] | None = None,
+    source: StrPath,
+    output: StrPath | None = None,
     *,
     feature_space: str | None = None,
     crops: Sequence[Crop] = WITH_CONTEXT,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -19,7 +18,7 @@ from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.bundle.vocabulary import bank_members, bank_of_encoder, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.models import open_session
 from og_pointcloud_export.lookup_grid import build_lookup_grid
@@ -38,9 +37,7 @@ class QueryModel:
     parity: dict[str, Any]
 
 
-def write_bundle(
-    cloud: SceneLike, path: str | os.PathLike[str], *, text_encoder: str | os.PathLike[str] | None = None
-) -> Path:
+def write_bundle(cloud: SceneLike, path: StrPath, *, text_encoder: StrPath | None = None) -> Path:
     """Write a cloud, or a scene, as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
 
     text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import StrPath
 
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
@@ -61,7 +62,7 @@ _NAMED: dict[str, Path] = {}
 """Files that datasets of this process came from, by what the datasets call them."""
 
 
-def scene_name(path: str | os.PathLike[str]) -> str:
+def scene_name(path: StrPath) -> str:
     """How a dataset names the .ogpc file that its labels came from: by the file's name, and digits that tell it from
     others of that name. Not by its path, since datasets are saved and passed on."""
     path = Path(path).resolve()

@@ -7,7 +7,6 @@ it is first asked, so that a table costs nothing until then.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +20,7 @@ from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_b
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, coordinate, printable
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.tables import csv_text
 
 LABELLED = "labelled"
@@ -160,13 +159,13 @@ class Instances(Sequence[Instance]):
         """A JSON-able dictionary a row (`Instance.to_dict`)."""
         return [row.to_dict() for row in with_boxes(self)]
 
-    def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
+    def to_json(self, path: StrPath | None = None) -> str:
         """The records as JSON text; also written to path, whole or not at all, where one is given."""
         text = json.dumps(self.to_records(), indent=2, ensure_ascii=False) + "\n"
         _write(path, text)
         return text
 
-    def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
+    def to_csv(self, path: StrPath | None = None) -> str:
         """The records as CSV text, a column a number; also written to path, whole or not at all."""
         text = csv_text([_flat(record) for record in self.to_records()])
         _write(path, text)
@@ -274,6 +273,6 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     return flat
 
 
-def _write(path: str | os.PathLike[str] | None, text: str) -> None:
+def _write(path: StrPath | None, text: str) -> None:
     if path is not None:
         write_file(path, text.encode())

@@ -28,10 +28,11 @@ from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError, span
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.scene import RIGID, float32_step, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
-SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
+SceneLike: TypeAlias = "LabelledScene | LabelledCloud | StrPath"
 
 ELSEWHERE_SHARE = 1 / 3
 """Where more than this share of the points asked lies too far from the scene, the two may be in different frames."""
@@ -202,7 +203,7 @@ class LabelledScene:
         return NearestPoint(self.cloud.xyz, self.cloud.spacing, self.cloud.reach)
 
 
-def load(path: str | os.PathLike[str]) -> LabelledScene:
+def load(path: StrPath) -> LabelledScene:
     """Open a .ogpc file; BundleError says what is wrong with any other.
 
     >>> import pathlib, tempfile

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +15,7 @@ from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.hosts import import_plugin
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points
 
@@ -134,12 +133,7 @@ class Segmentation:
         """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
         return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
 
-    def save(
-        self,
-        path: str | os.PathLike[str],
-        splats: Points | None = None,
-        source: str | os.PathLike[str] | None = None,
-    ) -> Path:
+    def save(self, path: StrPath, splats: Points | None = None, source: StrPath | None = None) -> Path:
         """Write the result, whole or not at all, as what the path's ending says.
 
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.

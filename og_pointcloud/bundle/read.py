@@ -16,6 +16,7 @@ from og_pointcloud.bundle import format as ogpc
 from og_pointcloud.bundle.known_graph import query_tables
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.text.text_features import check_names
 
@@ -37,7 +38,7 @@ class Bundle:
     manifest: dict[str, Any]
 
 
-def read_bundle(path: str | os.PathLike[str]) -> Bundle:
+def read_bundle(path: StrPath) -> Bundle:
     """Read and check a .ogpc file; BundleError, beginning with the path, for any other or damaged file.
 
     Each member's CRC-32 is checked. The manifest's sha256 digests are not: anyone can write them, so they tell files
@@ -65,7 +66,7 @@ def read_bundle(path: str | os.PathLike[str]) -> Bundle:
         raise BundleError(f"{path}: {error}") from None
 
 
-def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | None:
+def read_carried_encoder(path: StrPath) -> dict[str, bytes] | None:
     """The files of the text encoder that a .ogpc carries, by name, unchecked; None where it carries none."""
     path = Path(path)
     try:

@@ -7,7 +7,6 @@ Only the members that change are written anew, the graph and the arrays are copi
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, describe_member
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, find_encoder, read_text_encoder
@@ -50,9 +49,9 @@ class SceneWords:
 def scene_words(
     space: FeatureSpace,
     *,
-    text_features: str | os.PathLike[str] | None = None,
-    word_bank: str | os.PathLike[str] | None = None,
-    capture: str | os.PathLike[str] | None = None,
+    text_features: StrPath | None = None,
+    word_bank: StrPath | None = None,
+    capture: StrPath | None = None,
 ) -> SceneWords:
     """The words for a scene whose masks are of this feature space; cheap enough to be checked before a fit.
 
@@ -63,7 +62,7 @@ def scene_words(
     """
     left_out = []
 
-    def words_of(asked: str | os.PathLike[str] | None, own: str, read: Callable[[Path], tuple[Any, str]]) -> Any:
+    def words_of(asked: StrPath | None, own: str, read: Callable[[Path], tuple[Any, str]]) -> Any:
         """Of a file that was asked for, which must fit; else of the capture's own, which is left out if it does not."""
         if asked is None and (capture is None or not (Path(capture) / own).is_file()):
             return None
@@ -85,16 +84,14 @@ def scene_words(
     return SceneWords(vocabulary, bank, tuple(left_out))
 
 
-def bank_of_encoder(space: FeatureSpace, folder: str | os.PathLike[str] | None = None) -> WordBank | None:
+def bank_of_encoder(space: FeatureSpace, folder: StrPath | None = None) -> WordBank | None:
     """The word bank of a text encoder's folder, or of the encoder that is found for the space; None where that has none
     or is of another space."""
     encoder = find_encoder(space.name) if folder is None else read_text_encoder(folder)
     return encoder.word_bank if encoder is not None and encoder.feature_space == space.name else None
 
 
-def add_words(
-    path: str | os.PathLike[str], words: Vocabulary, feature_space: str, output: str | os.PathLike[str] | None = None
-) -> Vocabulary:
+def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrPath | None = None) -> Vocabulary:
     """Store words with their vectors in a .ogpc file, after those that it has; a word that it has gets the new vector.
     Returns all that it has now.
 
@@ -116,7 +113,7 @@ def add_words(
     return together
 
 
-def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:
+def read_bank(path: StrPath) -> tuple[WordBank, str]:
     """A text-features file as a bank, and its feature space; FeatureSpaceError where its words are too few."""
     vocabulary, feature_space = read_text_features(path)
     try:
@@ -125,9 +122,7 @@ def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:
         raise FeatureSpaceError(f"{path}: {error}") from None
 
 
-def store_bank(
-    path: str | os.PathLike[str], bank: WordBank, feature_space: str, output: str | os.PathLike[str] | None = None
-) -> None:
+def store_bank(path: StrPath, bank: WordBank, feature_space: str, output: StrPath | None = None) -> None:
     """Store a word bank in a .ogpc file, in place of one that it has; its answers are then calibrated.
 
     feature_space, output, errors: as for ``add_words``.
@@ -137,9 +132,7 @@ def store_bank(
     _rewrite(path, output, bundle.manifest, bank_members(bank))
 
 
-def carry_encoder(
-    path: str | os.PathLike[str], folder: str | os.PathLike[str], output: str | os.PathLike[str] | None = None
-) -> TextEncoder:
+def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None) -> TextEncoder:
     """Store a text encoder in a .ogpc file, which then answers any word wherever it goes. Returns the encoder.
 
     folder: what ``og-pointcloud export text`` wrote; a file without a word bank gets the encoder's. output: as for
@@ -153,7 +146,7 @@ def carry_encoder(
     return encoder
 
 
-def carried_encoder(path: str | os.PathLike[str] | None) -> CarriedEncoder:
+def carried_encoder(path: StrPath | None) -> CarriedEncoder:
     """A function that opens the text encoder in a .ogpc file, when it is first needed: for most questions it never is.
 
     It returns None where the file carries no encoder or is no longer there, and the same encoder again for an unchanged
@@ -162,7 +155,7 @@ def carried_encoder(path: str | os.PathLike[str] | None) -> CarriedEncoder:
     return partial(_carried, path)
 
 
-def _carried(path: str | os.PathLike[str] | None) -> TextEncoder | None:
+def _carried(path: StrPath | None) -> TextEncoder | None:
     if path is None or not Path(path).is_file():
         return None
     return _carried_once(Path(path).resolve(), Path(path).stat().st_mtime_ns)
@@ -174,7 +167,7 @@ def _carried_once(path: Path, _modified: int) -> TextEncoder | None:
     return TextEncoder(files, f"{path}: text_encoder") if files else None
 
 
-def encoder_members(folder: str | os.PathLike[str], space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
+def encoder_members(folder: StrPath, space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
     """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
     files = ENCODER.read(Path(folder))
     encoder = TextEncoder(files, str(folder))
@@ -194,12 +187,7 @@ def bank_members(bank: WordBank) -> dict[str, bytes]:
     return {BANK: npy_bytes(bank.vectors.astype(np.float16))}
 
 
-def _rewrite(
-    path: str | os.PathLike[str],
-    output: str | os.PathLike[str] | None,
-    manifest: Mapping[str, Any],
-    changes: Mapping[str, bytes],
-) -> None:
+def _rewrite(path: StrPath, output: StrPath | None, manifest: Mapping[str, Any], changes: Mapping[str, bytes]) -> None:
     """A bundle with some members replaced or added, and this manifest; the others are copied as they are."""
     # The manifest names all members: of those that change, bytes and checksums; the others' stay true.
     members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}

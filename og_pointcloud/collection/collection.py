@@ -22,6 +22,7 @@ from og_pointcloud.collection.lance import FEW_SCENES, LanceTables
 from og_pointcloud.collection.scoring import Block, load_block, share
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError, did_you_mean
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud.text.words import TextFeatures
@@ -96,7 +97,7 @@ class Collection:
     1
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, lance: str | None = None) -> None:
+    def __init__(self, path: StrPath, *, lance: str | None = None) -> None:
         """path: of an atlas; OgPointcloudError for any other or damaged file. lance: folder or URI of what
         `lance.write_lance` made of it, which is then searched in place of memory (extra 'lance')."""
         self.path = Path(path)
@@ -121,9 +122,7 @@ class Collection:
         self._stamp = stamp
 
     @classmethod
-    def index(
-        cls, folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progress: bool = True
-    ) -> Collection:
+    def index(cls, folder: StrPath, path: StrPath, *, progress: bool = True) -> Collection:
         """Bring an atlas up to date with the .ogpc files in a folder, and open it; `changes` says what was new.
 
         Arguments and errors as of `collection.index.index`.

@@ -22,6 +22,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.memory import peak_memory
 from og_pointcloud.fitting.tasks import LocalWorkers, Share, share_here
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, with_bar
@@ -43,8 +44,8 @@ class FitOptions:
     settings: FitSettings = field(default_factory=FitSettings)
     gaussians: str | Path | None = None
     mask_level: Literal["default", "small", "medium", "large"] = "large"
-    text_features: str | os.PathLike[str] | None = None
-    word_bank: str | os.PathLike[str] | None = None
+    text_features: StrPath | None = None
+    word_bank: StrPath | None = None
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,8 @@ class CaptureFit:
 
 
 def fit_many(
-    captures: Iterable[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
+    captures: Iterable[StrPath],
+    out: StrPath,
     executor: Executor | None = None,
     *,
     options: FitOptions | None = None,

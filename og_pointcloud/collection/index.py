@@ -11,7 +11,6 @@ words different vectors are of two encoders (two families), and words of one are
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,6 +27,7 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cloud import MIN_BANK, UNKNOWN_SPACE, WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.journal import with_bar
 
 SAME_ENCODER = 0.5
@@ -52,7 +52,7 @@ class Changes:
         return ", ".join([*parts, f"{self.unchanged} unchanged"])
 
 
-def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progress: bool = True) -> Changes:
+def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     """Bring an atlas up to date with all .ogpc files in a folder and the folders below.
 
     path: of the atlas, which is made where there is none. OgPointcloudError where the folder holds no such file, or the

@@ -20,6 +20,7 @@ from og_pointcloud.collection.index import families
 from og_pointcloud.collection.scoring import Block, load_block
 from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import OgPointcloudError, naming_extra
+from og_pointcloud.formats.atomic import StrPath
 
 INDEXED_FROM = 50_000
 """Rows from which a table has an index; of fewer every one is compared."""
@@ -39,7 +40,7 @@ def _database(uri: str) -> Any:
     return lancedb.connect(uri)
 
 
-def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
+def write_lance(atlas: StrPath, uri: str) -> None:
     """Write all that an atlas has to the database at a folder or URI (s3://...), in place of what is there."""
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 

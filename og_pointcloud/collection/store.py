@@ -12,7 +12,6 @@ the one before.
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -27,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.choosing import Standard
 from og_pointcloud.cloud import InstanceTable, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 
 APPLICATION, VERSION = 0x4F474154, 2
 """SQLite's application_id ("OGAT") and user_version; the second is raised when older atlases cannot be read."""
@@ -92,7 +91,7 @@ class Atlas:
 
     @classmethod
     @contextmanager
-    def reading(cls, path: str | os.PathLike[str]) -> Iterator[Atlas]:
+    def reading(cls, path: StrPath) -> Iterator[Atlas]:
         """For reading alone; several processes may."""
         path = Path(path)
         if not path.is_file():
@@ -103,7 +102,7 @@ class Atlas:
 
     @classmethod
     @contextmanager
-    def writing(cls, path: str | os.PathLike[str]) -> Iterator[Atlas]:
+    def writing(cls, path: StrPath) -> Iterator[Atlas]:
         """For one change, which takes effect when the block ends without an error. A missing file is made beside its
         place and moved there at the end: of two processes that make it at a time, the last to end has made it."""
         path = Path(path)

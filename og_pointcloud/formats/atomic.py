@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import IO, BinaryIO, TypeAlias
 
 from og_pointcloud.errors import OgPointcloudError
 
@@ -18,6 +18,8 @@ try:
 except ImportError:  # not on Windows: there nobody keeps a second process out
     fcntl = None
 
+StrPath: TypeAlias = "str | os.PathLike[str]"
+"""A path as callers give it."""
 LOCK = ".lock"
 """The file in a folder by which processes know that another works there."""
 STALE_S = 60.0
@@ -25,7 +27,7 @@ STALE_S = 60.0
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[BinaryIO]:
+def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A file to write that takes the place of ``path`` when, and only when, the block ends without an error.
 
     Several processes may write one path at a time: each file is whole, and the last one stays. Missing folders above it
@@ -56,7 +58,7 @@ def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator
         temporary.unlink(missing_ok=True)  # where it has not taken its place
 
 
-def write_file(path: str | os.PathLike[str], data: bytes) -> Path:
+def write_file(path: StrPath, data: bytes) -> Path:
     """Write a file whole or not at all, as `replacing` does; returns its path."""
     with replacing(path) as file:
         file.write(data)
@@ -64,7 +66,7 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> Path:
 
 
 @contextmanager
-def replacing_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """The path of a folder to make and to fill, which becomes ``path`` when, and only when, the block ends without an
     error. overwrite: it may take the place of a folder that is there; else there must be none."""
     path = Path(path)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, naming_extra
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import LARGEST, pose_of_quaternion
@@ -45,7 +44,7 @@ FROM_ALONG_X = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
 
-def read_e57(path: str | os.PathLike[str]) -> Points:
+def read_e57(path: StrPath) -> Points:
     """All scans of an E57 file in its world; points that the scanner marks as invalid are left out.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without pye57.
@@ -65,7 +64,7 @@ def read_e57(path: str | os.PathLike[str]) -> Points:
         return Points.from_world(xyz, rgb=rgb)
 
 
-def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> tuple[int, list[str]]:
+def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
     """Write an E57 file as a capture folder: ``images/``, ``transforms.json``, ``points.ply``.
 
     Returns the number of images, and of each one that cannot be used its name and why. SceneError where there is none.

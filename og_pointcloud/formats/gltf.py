@@ -11,7 +11,6 @@ Format: Khronos, "glTF 2.0 Specification", and the extensions' texts.
 from __future__ import annotations
 
 import json
-import os
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
@@ -42,7 +41,7 @@ NAME = "name"
 
 
 def write_gltf(
-    path: str | os.PathLike[str],
+    path: StrPath,
     xyz_world: NDArray[np.floating],
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import mmap
-import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -26,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
 
@@ -60,7 +59,7 @@ LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA_BYTES = 14
 
 
-def read_las(path: str | os.PathLike[str]) -> Points:
+def read_las(path: StrPath) -> Points:
     """Positions, and colors where the point format has some.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
@@ -85,12 +84,12 @@ def read_las(path: str | os.PathLike[str]) -> Points:
 
 
 def write_las(
-    path: str | os.PathLike[str],
+    path: StrPath,
     xyz_world: NDArray[np.floating],
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],
     names: Sequence[str],
-    source: str | os.PathLike[str] | None = None,
+    source: StrPath | None = None,
 ) -> None:
     """Write a labelled cloud, compressed where the path ends in .laz; whole or not at all.
 
@@ -118,7 +117,7 @@ def write_las(
                 raise SceneError(f"it cannot be written ({error!s:.120}): is there room?") from error
 
 
-def _is_las(path: str | os.PathLike[str]) -> bool:
+def _is_las(path: StrPath) -> bool:
     with open(path, "rb") as file:
         return file.read(len(SIGNATURE)) == SIGNATURE
 

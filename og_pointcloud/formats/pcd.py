@@ -5,7 +5,6 @@ Format: the Point Cloud Library's page "The PCD (Point Cloud Data) file format";
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_rows
 
 HEADER_LIMIT = 1 << 16
@@ -39,7 +39,7 @@ def looks_like_pcd(head: bytes) -> bool:
     return re.match(rb"(?:\s|#[^\n]*\n)*(?:VERSION|FIELDS)[ \t]", head) is not None
 
 
-def read_pcd(path: str | os.PathLike[str]) -> NDArray[np.void]:
+def read_pcd(path: StrPath) -> NDArray[np.void]:
     """(points,) structured array, one field per FIELDS entry (a sub-array where COUNT > 1), little endian.
 
     Padding fields, all called ``_`` in the file, become ``_0``, ``_1``. The VIEWPOINT (where the sensor stood) is not

@@ -5,7 +5,6 @@ Format: Greg Turk, "The PLY Polygon File Format", 1994; type names with bit widt
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_rows, storable_positions
 
 HEADER_LIMIT = 1 << 18
@@ -57,7 +56,7 @@ class _Header:
     data_offset: int
 
 
-def read_ply(path: str | os.PathLike[str]) -> dict[str, NDArray[np.void]]:
+def read_ply(path: StrPath) -> dict[str, NDArray[np.void]]:
     """Element name -> (count,) structured array, one field per property, native byte order.
 
     Elements are read up to the first with a list property (the faces of a mesh, which follow the vertices). SceneError,
@@ -73,9 +72,7 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, NDArray[np.void]]:
         return {element.name: _rows(file, element, header.byte_order) for element in plain}
 
 
-def write_ply(
-    path: str | os.PathLike[str], elements: Mapping[str, NDArray[np.void]], comments: Sequence[str] = ()
-) -> None:
+def write_ply(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments: Sequence[str] = ()) -> None:
     """Write structured arrays as a binary little-endian PLY, whole or not at all.
 
     elements: name -> (n,) structured array of scalar fields, int8 to int32 or float32, float64. comments: a line each.

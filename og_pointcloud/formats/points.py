@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.e57 import E57_SIGNATURE, read_e57
 from og_pointcloud.formats.gaussian_ply import gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
@@ -23,7 +23,7 @@ from og_pointcloud.formats.tables import colors, naming, positions
 from og_pointcloud.scene import Points
 
 
-def read_points(path: str | os.PathLike[str]) -> Points:
+def read_points(path: StrPath) -> Points:
     """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.
 
     World coordinates are read as float64; their median becomes the origin. Colors come as uint8 RGB, None where the
@@ -46,7 +46,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
         return Points.from_world(positions(found)[placed], rgb=colors(found[placed]))
 
 
-def read_places(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+def read_places(path: StrPath) -> NDArray[np.float64]:
     """(n, 3) float64 world coordinates of every row of such a file, to be labelled: rows with NaN or infinity stay, and
     a warning says that they stay unknown."""
     path = Path(path)
@@ -102,7 +102,7 @@ def _read(path: Path) -> Points | NDArray[np.void]:
 
 
 def write_labelled_ply(
-    path: str | os.PathLike[str],
+    path: StrPath,
     xyz_world: NDArray[np.floating],
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],

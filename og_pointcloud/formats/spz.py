@@ -13,7 +13,6 @@ Format: nianticlabs/spz, README, "Internals"; held against SuperSplat's files in
 from __future__ import annotations
 
 import gzip
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
@@ -57,7 +56,7 @@ def looks_like_spz(head: bytes) -> bool:
     return head.startswith((MAGIC, GZIP))
 
 
-def read_spz(path: str | os.PathLike[str]) -> Points:
+def read_spz(path: StrPath) -> Points:
     """Gaussians of an SPZ file; world coordinates, the median as origin.
 
     SceneError, beginning with the path, for a file that is damaged, foreign, or claims more than it holds;
@@ -76,7 +75,7 @@ def read_spz(path: str | os.PathLike[str]) -> Points:
         return activated(xyz * TURNED, scale, wxyz, opacity / 255, base)
 
 
-def write_spz(path: str | os.PathLike[str], points: Points, rgb: Bytes | None = None) -> None:
+def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
     """Write Gaussians as SPZ version 3, whole or not at all. rgb: (n, 3), instead of the points' own colors.
 
     Scales leave with steps of 6 % between 4.5e-5 and 379, colors with steps of two of 255; positions as finely as

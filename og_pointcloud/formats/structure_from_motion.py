@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from og_pointcloud.errors import SceneError, naming_extra
-from og_pointcloud.formats.atomic import replacing_folder
+from og_pointcloud.formats.atomic import StrPath, replacing_folder
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import numbered_images, upright_axes
 from og_pointcloud.formats.tables import naming
@@ -61,8 +61,8 @@ class PosesFound:
 
 
 def find_poses(
-    photographs: str | os.PathLike[str],
-    capture: str | os.PathLike[str] | None = None,
+    photographs: StrPath,
+    capture: StrPath | None = None,
     *,
     longest_side: int = 1600,
     threads: int = 1,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
 from og_pointcloud.masking.pretrained import Attention, best_device, load_pretrained, read_config, torch
 from og_pointcloud.models import MODEL_NAME
@@ -22,7 +22,7 @@ SIGLIP_COLORS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
 
 
-def load_model(folder: str | os.PathLike[str], attention: Attention = "sdpa") -> Any:
+def load_model(folder: StrPath, attention: Attention = "sdpa") -> Any:
     """A CLIP or SigLIP (SigLIP 2 of fixed size is one) of `pretrained.load_pretrained`."""
     return load_pretrained(Path(folder), CLASSES, attention)[0]
 
@@ -70,7 +70,7 @@ class TransformersModel:
 
     def __init__(
         self,
-        folder: str | os.PathLike[str],
+        folder: StrPath,
         feature_space: str | None = None,
         *,
         crops: tuple[Crop, ...] = WITH_CONTEXT,
@@ -98,7 +98,7 @@ class TransformersModel:
         return self.tower(torch.from_numpy(pixels).to(self.device))[1][0].cpu().numpy()
 
 
-def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
+def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
     """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
     stated = read_config(Path(folder), "preprocessor_config.json")
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
@@ -113,7 +113,7 @@ def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessi
     return Preprocessing(config.vision_config.image_size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number])
 
 
-def published_name(folder: str | os.PathLike[str]) -> str:
+def published_name(folder: StrPath) -> str:
     """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
     name = read_config(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):

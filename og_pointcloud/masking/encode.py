@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.dense import DenseEncoder
@@ -51,7 +52,7 @@ CROPS_PER_RUN = 16
 """Bounds memory: a run of a large model holds some 100 MB a crop."""
 
 
-def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
+def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
     """Open an encoder; nothing is downloaded.
 
     name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
@@ -71,7 +72,7 @@ def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskE
     return DenseEncoder(model)
 
 
-def _open_model(name: str | os.PathLike[str]) -> ImageModel:
+def _open_model(name: StrPath) -> ImageModel:
     if name == "demo":
         return OnnxModel(DEMO_FOLDER / "image")
     # A folder by its path, then by the feature space that it says it is of, then what other tools have fetched.
@@ -128,7 +129,7 @@ class CropEncoder(MaskEncoder):
 class OnnxModel:
     """An exported image encoder (an `ImageModel`), run by onnxruntime."""
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: StrPath) -> None:
         """folder: what ``og-pointcloud export image`` wrote; OgPointcloudError where it is damaged or another's."""
         self.where = str(folder)
         files = ENCODER.read(Path(folder))

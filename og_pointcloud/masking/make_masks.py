@@ -9,7 +9,6 @@ says that they were made here, and how.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 import warnings
@@ -23,7 +22,7 @@ import numpy as np
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import locked, replacing, write_file
+from og_pointcloud.formats.atomic import StrPath, locked, replacing, write_file
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MADE_NAME, MASKS_FOLDER, TRACKS
@@ -57,9 +56,9 @@ class MasksMade:
 
 
 def make_masks(
-    capture: str | os.PathLike[str],
+    capture: StrPath,
     settings: MaskSettings | None = None,
-    output: str | os.PathLike[str] | None = None,
+    output: StrPath | None = None,
     *,
     overwrite: bool = False,
     progress: bool = True,

@@ -7,7 +7,6 @@ answers points; words are in ``sam3``.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.automatic import AutomaticMasks
 from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_config, torch
 from og_pointcloud.models import fetched_model
@@ -48,7 +48,7 @@ class Preparation:
     std: tuple[float, ...]
 
 
-def open_sam(name: str | os.PathLike[str]) -> AutomaticMasks:
+def open_sam(name: StrPath) -> AutomaticMasks:
     """A proposer from a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
     return AutomaticMasks(SamPredictor(name))
 
@@ -68,7 +68,7 @@ class LoadedModel:
         return prepared(image, self.preparation).to(self.device)
 
 
-def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> LoadedModel:
+def load_sam(name: StrPath, classes: Mapping[str, str]) -> LoadedModel:
     """A model's folder or a fetched OWNER/MODEL, for evaluation. classes: model_type -> transformers' class to take.
 
     SceneError where there is none of these types, or it cannot be read.
@@ -88,7 +88,7 @@ def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> Loaded
 class SamPredictor:
     """A `PointPredictor` on SAM, SAM-HQ, SAM 2 or SAM 3."""
 
-    def __init__(self, name: str | os.PathLike[str]) -> None:
+    def __init__(self, name: StrPath) -> None:
         self.loaded = load_sam(name, CLASSES)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}

@@ -7,7 +7,6 @@ that code overlapping tracks are not thinned out, but settling the masks of an i
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.pretrained import torch, transformers
 from og_pointcloud.masking.sam import LoadedModel, load_sam
@@ -30,7 +30,7 @@ TRACKS_OF_A_RUN = 1 << 32
 class NamedThings:
     """A proposer of what words name in an image by itself."""
 
-    def __init__(self, name: str | os.PathLike[str], words: Sequence[str]) -> None:
+    def __init__(self, name: StrPath, words: Sequence[str]) -> None:
         """name: as for `sam.open_sam`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
         self._loaded = load_sam(name, {"sam3": "Sam3Model", "sam3_video": "Sam3Model"})
         self._tokens = _tokens(self._loaded, words)
@@ -53,7 +53,7 @@ class NamedThings:
 class FollowedWords:
     """A proposer of what words name in images that come one after the other, which keeps the tracks of things."""
 
-    def __init__(self, name: str | os.PathLike[str], words: Sequence[str], images_before: int = 0) -> None:
+    def __init__(self, name: StrPath, words: Sequence[str], images_before: int = 0) -> None:
         """As `NamedThings`, with a SAM 3 that has its tracker. images_before: how many images earlier runs have done,
         so that tracks of this run have other numbers than theirs."""
         self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.mapping.changes import Changes
 from og_pointcloud.mapping.merging import joined
 from og_pointcloud.show.live import CHANGES
@@ -54,7 +54,7 @@ def both_visits(
 
 
 def write_changes_page(
-    path: str | os.PathLike[str], before: LabelledCloud, after: LabelledCloud, changes: Changes, up: NDArray[np.float64]
+    path: StrPath, before: LabelledCloud, after: LabelledCloud, changes: Changes, up: NDArray[np.float64]
 ) -> None:
     """Write the page, whole or not at all. up: (3,) unit."""
     both, change = both_visits(before, after, changes)

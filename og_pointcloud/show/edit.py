@@ -15,7 +15,6 @@ of the scene's point i; else each point of the cloud takes the id of the scene's
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Real
@@ -32,6 +31,7 @@ from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
@@ -60,7 +60,7 @@ class EditOptions(TypedDict, total=False):
         a 3DGS file often has no label; default 0. text_features: as for ``segment``.
     """
 
-    cloud: str | os.PathLike[str] | None
+    cloud: StrPath | None
     halo: float
     text_features: TextFeatures
 
@@ -77,7 +77,7 @@ class Edit:
     notes: tuple[str, ...] = ()
 
 
-def remove(scene: SceneLike, what: What, output: str | os.PathLike[str], **options: Unpack[EditOptions]) -> Edit:
+def remove(scene: SceneLike, what: What, output: StrPath, **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud without some instances.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, of splats
@@ -92,15 +92,13 @@ def remove(scene: SceneLike, what: What, output: str | os.PathLike[str], **optio
     return subject.write(output, subject.rows[~subject.chosen], "removed")
 
 
-def extract(scene: SceneLike, what: What, output: str | os.PathLike[str], **options: Unpack[EditOptions]) -> Edit:
+def extract(scene: SceneLike, what: What, output: StrPath, **options: Unpack[EditOptions]) -> Edit:
     """Write some instances alone. Arguments and errors as for `remove`."""
     subject = _subject(scene, what, output, **options)
     return subject.write(output, subject.rows[subject.chosen], "extracted")
 
 
-def recolour(
-    scene: SceneLike, what: What, output: str | os.PathLike[str], color: ArrayLike, **options: Unpack[EditOptions]
-) -> Edit:
+def recolour(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud with some instances in another color.
 
     color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the color, and Gaussians also
@@ -114,7 +112,7 @@ def recolour(
 
 
 def insert(
-    cloud: str | os.PathLike[str], other: str | os.PathLike[str], output: str | os.PathLike[str],
+    cloud: StrPath, other: StrPath, output: StrPath,
     pose: ArrayLike | None = None,
 ) -> Edit:  # fmt: skip
     """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
@@ -156,7 +154,7 @@ class _Cloud:
     def rows(self) -> Rows:
         return self.elements["vertex"]
 
-    def write(self, output: str | os.PathLike[str], rows: Rows, verb: str) -> Edit:
+    def write(self, output: StrPath, rows: Rows, verb: str) -> Edit:
         """Write other rows in place of the cloud's."""
         changed, elements, notes = int(self.chosen.sum()), {**self.elements, "vertex": rows}, self.notes
         if Path(output).suffix == ".spz":
@@ -168,7 +166,7 @@ class _Cloud:
 
 
 def _subject(
-    scene: SceneLike, what: What, output: str | os.PathLike[str], cloud: str | os.PathLike[str] | None = None,
+    scene: SceneLike, what: What, output: StrPath, cloud: StrPath | None = None,
     halo: float = 0.0, text_features: TextFeatures = None,
 ) -> _Cloud:  # fmt: skip
     """Reads the cloud and finds the points that are meant."""
@@ -213,7 +211,7 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
 
 
 def _ids_of_points(
-    scene: LabelledScene, xyz: NDArray[np.float64], cloud: str | os.PathLike[str] | None
+    scene: LabelledScene, xyz: NDArray[np.float64], cloud: StrPath | None
 ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """Instance id of each point of the cloud: the scene's own where it is the same cloud, else the nearest point's."""
     if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_PLACE * scene.cloud.spacing).all():
@@ -244,7 +242,7 @@ def _halo(
     return near
 
 
-def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]]) -> None:
+def _check_output(output: StrPath, inputs: Iterable[StrPath]) -> None:
     path = Path(output)
     if path.suffix not in (".ply", ".spz"):
         raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply, or .spz of splats")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import os
 import struct
 import zlib
 from dataclasses import replace
@@ -17,7 +16,7 @@ from og_pointcloud.ask.picking import front_points
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.collection.collection import Collection, Finding, Findings
 from og_pointcloud.errors import OgPointcloudError, coordinate
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.show.viewpoint import Viewpoint
 
 SIDE_PX = 200
@@ -47,7 +46,7 @@ b {{ font-size: 15px }} .score {{ float: right }}
 """
 
 
-def write_findings(path: str | os.PathLike[str], collection: Collection, findings: Findings, title: str) -> None:
+def write_findings(path: StrPath, collection: Collection, findings: Findings, title: str) -> None:
     """Write the page, whole or not at all. title: what was asked."""
     text = PAGE.format(
         title=html.escape(title),

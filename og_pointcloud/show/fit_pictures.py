@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.images import require_cv2, write_png
 
 WIDTH, HEIGHT, STRIP, MARGIN = 360, 200, 26, 10
@@ -16,7 +16,7 @@ WIDTH, HEIGHT, STRIP, MARGIN = 360, 200, 26, 10
 CURVE = (31, 119, 180)
 
 
-def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
+def training_picture(stages: Sequence[Mapping[str, Any]], path: StrPath) -> Path:
     """Write a PNG of each stage's losses against its steps, side by side.
 
     stages: ``cloud.provenance["notes"]["training"]``. Each has a scale of its own, from zero.

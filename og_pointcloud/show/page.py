@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from og_pointcloud.ask.instances import with_boxes
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import WORDS, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
@@ -54,7 +53,7 @@ class Look:
 
 
 def write_page(
-    path: str | os.PathLike[str],
+    path: StrPath,
     scene: LabelledScene,
     result: Segmentation,
     view: Viewpoint,

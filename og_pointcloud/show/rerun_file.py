@@ -6,7 +6,6 @@ viewer is started: a file can be looked at anywhere, later, and again. Places ar
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.picking import NO_POINT, front_points, in_world
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Camera, Scene
@@ -79,7 +78,7 @@ class RerunSink:
 
 
 @contextmanager
-def rerun_sink(path: str | os.PathLike[str]) -> Iterator[RerunSink]:
+def rerun_sink(path: StrPath) -> Iterator[RerunSink]:
     """A sink whose file takes its place when the block ends without an error."""
     recording = rerun.RecordingStream(APPLICATION)
     with replacing(path) as file:
@@ -90,7 +89,7 @@ def rerun_sink(path: str | os.PathLike[str]) -> Iterator[RerunSink]:
             recording.disconnect()
 
 
-def write_rerun(path: str | os.PathLike[str], capture: Scene, cloud: LabelledCloud, *, progress: bool = False) -> None:
+def write_rerun(path: StrPath, capture: Scene, cloud: LabelledCloud, *, progress: bool = False) -> None:
     """What a fit saw and made: each view with its masks, the instances it is the first to show, the stages' seconds.
 
     capture: what was fitted. cloud: what came of it.

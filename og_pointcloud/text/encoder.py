@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import MANIFEST, MODEL_NAME, EncoderFormat, home_folder, open_session
 from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
@@ -128,7 +129,7 @@ class TextEncoder:
         return open_session(self._graph, bounded=True)
 
 
-def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
+def read_text_encoder(folder: StrPath) -> TextEncoder:
     """Open a folder that ``og-pointcloud export text`` wrote, checked whole; OgPointcloudError for any other.
 
     Asking for the same unchanged folder again gives the same encoder.

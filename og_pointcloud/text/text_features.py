@@ -6,7 +6,6 @@ encoder.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import read_npz
 
 MAX_UNPACKED_BYTES = 1 << 30
@@ -23,7 +23,7 @@ MAX_WORDS_BYTES = 1 << 24
 LONGEST_NAME = 1000
 
 
-def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
+def read_text_features(path: StrPath) -> tuple[Vocabulary, str]:
     """The names and vectors of a text-features .npz, and the name of its feature space.
 
     Raises FeatureSpaceError, beginning with the path, where the file cannot be read, an entry is missing, or a name
@@ -88,7 +88,7 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
     return Vocabulary(tuple(names), vectors)
 
 
-def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
+def read_words(path: StrPath) -> tuple[str, ...]:
     """The words of a text file, one a line, UTF-8; empty lines and repeated words are left out.
 
     OgPointcloudError where it cannot be read, or has no words.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, did_you_mean, printable
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
-TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | None"
+TextFeatures: TypeAlias = "StrPath | tuple[Vocabulary, str] | None"
 LONGEST_WORD = 60
 """Characters of a word that is not known that are said again."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +15,7 @@ from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import SceneLike
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, first_line
+from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.text.words import Labels
 
 OLDEST = (0, 19)
@@ -29,7 +29,7 @@ class Segmented(NamedTuple):
     result: Segmentation
 
 
-def read(path: str | os.PathLike[str]) -> Any:
+def read(path: StrPath) -> Any:
     """Open3D's tensor cloud of a file, Gaussians with their attributes.
 
     SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read;
