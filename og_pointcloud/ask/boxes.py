@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import quaternion_of, upright_axes
-
-DoubleArray = NDArray[np.float64]
+from og_pointcloud.scene import DoubleArray
 
 DIRECTIONS = 180
 """Directions around a circle along which the extreme points are taken as the corners of an outline."""

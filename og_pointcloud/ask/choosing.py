@@ -38,6 +38,7 @@ from og_pointcloud.cloud import (
     finite_rows,
     unit_rows,
 )  # fmt: skip
+from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 from og_pointcloud.settings import ChoosingSettings
 
 
@@ -92,17 +93,17 @@ class Choice:
     calibrated: false where there was no bank: probability and unknown are then NaN, evidence is the cosine.
     """
 
-    labels: NDArray[np.int32]
-    probability: NDArray[np.float32]
-    unknown: NDArray[np.float32]
-    table: NDArray[np.float32]
-    evidence: NDArray[np.float32]
+    labels: IntArray
+    probability: FloatArray
+    unknown: FloatArray
+    table: FloatArray
+    evidence: FloatArray
     reasons: NDArray[np.int8]
-    membership: NDArray[np.float32]
+    membership: FloatArray
     calibrated: bool = True
 
     @property
-    def scores(self) -> NDArray[np.float32]:
+    def scores(self) -> FloatArray:
         """(K, L) what words are ranked by: the probability where calibrated, else the cosine (-inf: no descriptor)."""
         return self.table if self.calibrated else self.evidence
 
@@ -125,7 +126,7 @@ class Choice:
         return [(names[index], float(self.scores[instance, index])) for index in order]
 
     @cached_property
-    def by_id(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+    def by_id(self) -> tuple[IntArray, FloatArray, NDArray[np.int8]]:
         """Label, score and reason by instance id, (K + 3,) each: after the last instance those of ids -3, -2 and -1.
 
         The score is that of a point with the id. Where calibrated: its instance's probability times the membership, as
@@ -142,7 +143,7 @@ class Choice:
             np.append(self.reasons, list(beyond.values())).astype(np.int8),
         )
 
-    def at(self, instances: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+    def at(self, instances: NDArray[np.integer]) -> tuple[IntArray, FloatArray, NDArray[np.int8]]:
         """Label, score and reason of points, (N,) each, as `by_id` has them, by their instance ids."""
         labels, scores, reasons = self.by_id
         return labels[instances], scores[instances], reasons[instances]  # negative ids index from the end
@@ -157,9 +158,9 @@ class Standard:
     common: (D,) float32. scale, shift: (R,) float32. sharpness: as `Chooser.sharpness`.
     """
 
-    common: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    shift: NDArray[np.float32]
+    common: FloatArray
+    scale: FloatArray
+    shift: FloatArray
     sharpness: float
 
 
@@ -236,8 +237,8 @@ class Chooser:
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
-        self, evidence: NDArray[np.floating], texts: NDArray[np.float32], directions: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        self, evidence: NDArray[np.floating], texts: FloatArray, directions: NDArray[np.floating]
+    ) -> tuple[DoubleArray, DoubleArray]:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
         Likelihoods are those of a linear discriminant: a fitting word's evidence is normal about ``sharpness`` with
@@ -291,7 +292,7 @@ class Chooser:
         )
 
 
-def log_mean_likelihood(exponents: NDArray[np.float64], sharpness: ArrayLike) -> NDArray[np.float64]:
+def log_mean_likelihood(exponents: DoubleArray, sharpness: ArrayLike) -> DoubleArray:
     """(n,) log of the mean likelihood that words give, at least that of a word that fits by chance. exponents: (n, W)
     sharpness times evidence. sharpness: (n,), or one for all."""
     # The mean of exp(sharpness * e) over standard normal evidence e is exp(sharpness^2 / 2).
@@ -301,9 +302,7 @@ def log_mean_likelihood(exponents: NDArray[np.float64], sharpness: ArrayLike) ->
     return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(exponents.shape[1]))
 
 
-def common_part(
-    descriptors: NDArray[np.float32], bank_directions: NDArray[np.float32], sharpness: float
-) -> NDArray[np.float32]:
+def common_part(descriptors: FloatArray, bank_directions: FloatArray, sharpness: float) -> FloatArray:
     """(D,) what is taken off each descriptor: the mean over kinds of things, times 1 - 1 / (number of kinds).
 
     Each kind counts once, so that an object in pieces, or a hall of chairs, does not turn what makes a chair into what
@@ -326,7 +325,7 @@ def common_part(
     return common
 
 
-def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _distinct(texts: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(T,) number of each text among the different ones, and (different,) where each comes first."""
     # Five digits: the same text is the same vector again, whatever length it was given at.
     rounded = np.round(unit_rows(texts), 5) + 0.0  # -0 becomes 0
@@ -334,7 +333,7 @@ def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.
     return number.reshape(-1), first
 
 
-def _moments(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _moments(scores: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation of each row, as columns; a row without spread gets no evidence at all."""
     spread = scores.std(axis=1, keepdims=True)  # 1e-7 is float32's rounding of a cosine: no spread at all
     return scores.mean(axis=1, keepdims=True), np.where(spread > 1e-7, spread, np.float32(np.inf))

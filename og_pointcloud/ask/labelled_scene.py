@@ -29,7 +29,7 @@ from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError, span
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.scene import RIGID, float32_step, rotation_error
+from og_pointcloud.scene import RIGID, DoubleArray, FloatArray, IntArray, float32_step, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | StrPath"
@@ -85,12 +85,12 @@ class LabelledScene:
         return cls(Bundle(None, cloud, None, {}))
 
     @cached_property
-    def xyz(self) -> NDArray[np.float64]:
+    def xyz(self) -> DoubleArray:
         """(n, 3) float64, world coordinates."""
         return self.cloud.xyz_world
 
     @cached_property
-    def certainty(self) -> NDArray[np.float32] | None:
+    def certainty(self) -> FloatArray | None:
         """(n,) float32 in [0, 1], as ``LabelledCloud.certainty``; None where that is not known."""
         stored = self.cloud.certainty
         return None if stored is None else (stored / 255).astype(np.float32)
@@ -128,7 +128,7 @@ class LabelledScene:
             return self.words(labels, text_features)
         return Vocabulary((), np.zeros((0, self.cloud.space.width), np.float32))
 
-    def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
+    def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> IntArray:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
 
         points: (N, 3), world coordinates. A row with NaN or infinity, as depth cameras send them, is out of reach.
@@ -156,7 +156,7 @@ class LabelledScene:
                 "points farther than that have no label"
             )
 
-    def certainty_at(self, points: NDArray[np.floating]) -> NDArray[np.float32] | None:
+    def certainty_at(self, points: NDArray[np.floating]) -> FloatArray | None:
         """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
         the scene does not know it. points: (N, 3), world coordinates. An exact search of every point."""
         if self.certainty is None or points is self.xyz:
@@ -168,7 +168,7 @@ class LabelledScene:
         certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the added 0
         return certainty
 
-    def _local(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+    def _local(self, points: NDArray[np.floating]) -> FloatArray:
         """(N, 3) in the cloud's frame; infinite where that leaves float32."""
         points = np.asarray(points, np.float64)
         local = np.empty(points.shape, np.float32)
@@ -177,7 +177,7 @@ class LabelledScene:
                 np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
         return local
 
-    def _look_up(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
+    def _look_up(self, local: FloatArray) -> IntArray:
         """(N,) instance of each point: the graph's answer where it is certain, else by exact search. local: (N, 3)."""
         if self._graph is None:
             instances, still_open = np.full(len(local), TOO_FAR, np.int32), np.arange(len(local))
@@ -376,7 +376,7 @@ def _scene_once(cloud: LabelledCloud) -> LabelledScene:
     return LabelledScene.from_cloud(cloud)
 
 
-def pose_matrix(pose: ArrayLike) -> NDArray[np.float64]:
+def pose_matrix(pose: ArrayLike) -> DoubleArray:
     """A pose (4, 4) as float64. SceneError for numbers that are not finite and a last row other than 0 0 0 1."""
     matrix = numbers_of(pose)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
@@ -390,7 +390,7 @@ def pose_matrix(pose: ArrayLike) -> NDArray[np.float64]:
     return matrix.astype(np.float64)
 
 
-def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:
+def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
     if pose is None:
         return points
     matrix = pose_matrix(pose)
@@ -418,7 +418,7 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
     return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
-def _misplaced(points: NDArray[np.float64], far: int, scene: LabelledScene) -> str:
+def _misplaced(points: DoubleArray, far: int, scene: LabelledScene) -> str:
     """Why points, all finite, may not lie where the scene has them, "" if nothing says so. far: how many are too far
     from it."""
     if len(scene.cloud) == 0:

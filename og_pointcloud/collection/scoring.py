@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.choosing import log_mean_likelihood
 from og_pointcloud.cloud import WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
+from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 from og_pointcloud.settings import ChoosingSettings
 
 RELEVANCY_TEMPERATURE = 10.0
@@ -43,16 +44,16 @@ class Block:
     """
 
     entries: tuple[SceneEntry, ...]
-    vectors: NDArray[np.float32]
-    shift: NDArray[np.float32]
+    vectors: FloatArray
+    shift: FloatArray
     bounds: NDArray[np.intp]
-    scene: NDArray[np.int32]
-    instance: NDArray[np.int32]
-    points: NDArray[np.int32]
-    center: NDArray[np.float64]
-    size: NDArray[np.float64]
+    scene: IntArray
+    instance: IntArray
+    points: IntArray
+    center: DoubleArray
+    size: DoubleArray
     bank: WordBank | None
-    sharpness: NDArray[np.float64]
+    sharpness: DoubleArray
 
     def __len__(self) -> int:
         return len(self.instance)
@@ -68,7 +69,7 @@ class Block:
         return np.searchsorted(self.scene, np.arange(len(self.entries) + 1))
 
     @cached_property
-    def _reach(self) -> NDArray[np.float64]:
+    def _reach(self) -> DoubleArray:
         """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; infinite, which meets no box,
         for a scene without any."""
         reach = np.full((len(self.entries), 2, 3), np.inf)
@@ -78,7 +79,7 @@ class Block:
         return reach
 
     @cached_property
-    def _bound(self) -> NDArray[np.float64]:
+    def _bound(self) -> DoubleArray:
         """(2, I) factor and summand: the logit of an instance's score is at most factor * evidence + summand."""
         # `_relevancy` and `_log_odds` with the least that rivals can say: a cosine of -1, and what chance gives.
         if self.bank is None:
@@ -87,20 +88,20 @@ class Block:
         return np.stack([sharpness, -(sharpness**2) / 2 - np.log(ChoosingSettings().kinds)])
 
     @cached_property
-    def _judges(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _judges(self) -> tuple[FloatArray, FloatArray]:
         """(D,) what the words of the bank share, and (B, D) unit rows of what they do not."""
         assert self.bank is not None
         return self.bank.mean, unit_rows(self.bank.vectors - self.bank.mean)
 
-    def meets(self, box: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def meets(self, box: DoubleArray) -> NDArray[np.bool_]:
         """(S,) whether a scene may have an instance with its middle in a box (2, 3)."""
         return ((self._reach[:, 0] <= box[1]) & (self._reach[:, 1] >= box[0])).all(axis=1)
 
-    def direction(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
+    def direction(self, text: FloatArray) -> FloatArray:
         """(D,) unit vector of a text (D,) whose products with the vectors say how it fits."""
         return unit_rows(text if self.bank is None else unit_rows(text) - self._judges[0]).astype(np.float32)
 
-    def evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
+    def evidence(self, rows: NDArray[np.intp], directions: FloatArray) -> FloatArray:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
         best = np.empty((len(rows), len(directions)), np.float32)
         for start in range(0, len(rows), ROWS_AT_ONCE):
@@ -110,9 +111,7 @@ class Block:
             best[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
         return best
 
-    def _best_of(
-        self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def _best_of(self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: FloatArray) -> FloatArray:
         """(n, L) each instance's most evidence. rows: of descriptors, instance after instance; first: (n,) where each
         instance's begin among them."""
         scores = self.vectors[rows] @ directions.T
@@ -121,12 +120,12 @@ class Block:
 
     def rank(
         self,
-        text: NDArray[np.float32],
-        rivals: NDArray[np.float32],
+        text: FloatArray,
+        rivals: FloatArray,
         asked: NDArray[np.bool_],
         top: int,
-        box: NDArray[np.float64] | None = None,
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        box: DoubleArray | None = None,
+    ) -> tuple[NDArray[np.intp], DoubleArray]:
         """The best ``top`` instances of scenes for a text (D,), of equals the first, and the logit of their scores.
 
         asked: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
@@ -151,30 +150,26 @@ class Block:
         best, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
         return rows[best], key
 
-    def _bounds_of(self, begin: int, end: int, direction: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _bounds_of(self, begin: int, end: int, direction: FloatArray) -> DoubleArray:
         """(end - begin,) bounds of the scores of neighboring instances for a direction (1, D)."""
         rows = slice(*self.bounds[[begin, end]].tolist())
         evidence = self._best_of(rows, self.bounds[begin:end] - rows.start, direction)[:, 0]
         factor, summand = self._bound[:, begin:end]
         return factor * evidence + summand
 
-    def _outside(self, asked: NDArray[np.bool_], box: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _outside(self, asked: NDArray[np.bool_], box: DoubleArray) -> NDArray[np.intp]:
         """The instances of scenes that have their middles outside of a box; only scenes that it cuts have any."""
         is_cut = asked & ((self._reach[:, 0] < box[0]) | (self._reach[:, 1] > box[1])).any(axis=1)
         rows = _ranges(self._starts[:-1][is_cut], self._starts[1:][is_cut])
         middle = self.center[rows]
         return rows[((middle < box[0]) | (middle > box[1])).any(axis=1)]
 
-    def _relevancy(
-        self, rows: NDArray[np.intp], direction: NDArray[np.float32], rivals: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _relevancy(self, rows: NDArray[np.intp], direction: FloatArray, rivals: FloatArray) -> DoubleArray:
         """Logit of how much better a direction (1, D) fits than the best rival; without rivals, than nothing at all."""
         cosine = self.evidence(rows, np.concatenate([direction, rivals])).astype(np.float64)
         return RELEVANCY_TEMPERATURE * (cosine[:, 0] - (cosine[:, 1:].max(axis=1) if len(rivals) else 0))
 
-    def _log_odds(
-        self, rows: NDArray[np.intp], direction: NDArray[np.float32], others: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
+    def _log_odds(self, rows: NDArray[np.intp], direction: FloatArray, others: FloatArray) -> DoubleArray:
         """Logit of the probability (`choosing.Chooser`) of a direction (1, D) against the bank's other words."""
         sharpness = self.sharpness[self.scene[rows]]
         exponents = sharpness[:, None] * self.evidence(rows, np.concatenate([direction, others]))
@@ -188,8 +183,8 @@ def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp
 
 
 def largest(
-    bound: NDArray[np.float64], key_of: Callable[[NDArray[np.intp]], NDArray[np.float64]], top: int
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    bound: DoubleArray, key_of: Callable[[NDArray[np.intp]], DoubleArray], top: int
+) -> tuple[NDArray[np.intp], DoubleArray]:
     """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are asked for.
 
     bound: (n,) what the keys do not exceed; places of -inf are none. key_of: the keys of some places.
@@ -207,7 +202,7 @@ def largest(
         count *= 4
 
 
-def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
+def share(logit: DoubleArray) -> DoubleArray:
     """The probability of a logit."""
     return 1 / (1 + np.exp(-np.clip(logit, -700, 700)))
 

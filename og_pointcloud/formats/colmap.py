@@ -23,7 +23,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
 from og_pointcloud.formats.poses import PosedImage, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, DoubleArray
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dslr/colmap")
 
@@ -89,7 +89,7 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
     return tuple(images)
 
 
-def read_points3d(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def read_points3d(model: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     """World coordinates (n, 3) float64 and colors (n, 3) uint8 of the triangulated points."""
     return _records(model, "points3D", _points_binary, _points_text)
 
@@ -118,7 +118,7 @@ def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
 
 def _camera(
     camera_model: str, size: tuple[int, int], values: dict[str, float]
-) -> tuple[Callable[[NDArray[np.float64]], Camera], Lens | None]:
+) -> tuple[Callable[[DoubleArray], Camera], Lens | None]:
     """A function from a pose (world to camera) to the camera, and the lens. values: by the names of the parameters."""
     if camera_model == "EQUIRECTANGULAR":
         return partial(spherical_camera, *size), SPHERICAL
@@ -243,7 +243,7 @@ TRACK_LENGTH_AT = POINT.itemsize - 8
 TRACK_ELEMENT_BYTES = 8
 
 
-def _points_binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _points_binary(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     """Records of unequal length, as each ends in its track: a loop finds where they start, numpy reads the rest."""
     source = _Binary(path)
     data, offsets = source.data, np.empty(source.count(POINT.itemsize), np.int64)
@@ -261,7 +261,7 @@ def _points_binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return points["xyz"].astype(np.float64), points["rgb"].copy()
 
 
-def _points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _points_text(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     """One line a point: id, x, y, z, r, g, b, error, track."""
     try:
         with warnings.catch_warnings():

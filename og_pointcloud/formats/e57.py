@@ -25,9 +25,7 @@ from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import LARGEST, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Points
-
-Doubles = NDArray[np.float64]
+from og_pointcloud.scene import DoubleArray, Points
 
 E57_SIGNATURE = b"ASTM-E57"
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -49,7 +47,7 @@ def read_e57(path: StrPath) -> Points:
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without pye57.
     """
-    parts: list[tuple[Doubles, NDArray[np.uint8] | None]] = []
+    parts: list[tuple[DoubleArray, NDArray[np.uint8] | None]] = []
     path = Path(path)
     with _opened(path) as (libe57, file):
         most = MOST_POINTS_PER_BYTE * path.stat().st_size
@@ -133,7 +131,7 @@ def _number(node: Any, name: str) -> float:
     return value
 
 
-def _pose(node: Any) -> Doubles | None:
+def _pose(node: Any) -> DoubleArray | None:
     """(4, 4) to the file's world, or None where the file has none."""
     if not node.isDefined("pose"):
         return None
@@ -145,7 +143,7 @@ def _pose(node: Any) -> Doubles | None:
 # Points -----------------------------------------------------------------------------------------------------------
 
 
-def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, NDArray[np.uint8] | None]]:
+def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[DoubleArray, NDArray[np.uint8] | None]]:
     """Chunks of points in the file's world, and their colors."""
     vector = scan["points"]
     prototype = libe57.StructureNode(vector.prototype())
@@ -180,7 +178,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, N
     return parts
 
 
-def _from_angles(distance: Doubles, azimuth: Doubles, elevation: Doubles) -> Doubles:
+def _from_angles(distance: DoubleArray, azimuth: DoubleArray, elevation: DoubleArray) -> DoubleArray:
     """(n, 3) from range and radians: azimuth from x towards y, elevation above the xy plane."""
     flat = distance * np.cos(elevation)
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])

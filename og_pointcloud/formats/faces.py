@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.lenses import Lens
-from og_pointcloud.scene import NOT_SEEN, Camera
-
-Doubles = NDArray[np.float64]
+from og_pointcloud.scene import NOT_SEEN, Camera, DoubleArray, FloatArray, IntArray
 
 ONE_VIEW = float(np.tan(np.radians(55)))
 """Tangent of the angle from the axis to a border; a pinhole that looks wider stretches its rim more than threefold."""
@@ -69,12 +67,12 @@ class Face:
         size = _scaled(self.camera, width / self.whole.width, height / self.whole.height)
         return replace(self, camera=self.camera.resized(*size), whole=self.whole.resized(width, height))
 
-    def mask_ids(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+    def mask_ids(self, ids: IntArray) -> IntArray:
         """The ids (h, w) of the distorted image -> (H, W) of this view, by nearest pixel; NOT_SEEN where it has
         none."""
         return self._picked(ids, NOT_SEEN)
 
-    def depths(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    def depths(self, depth: FloatArray) -> FloatArray:
         """As `mask_ids`, for depths along this view's axis; 0 where the image has none."""
         return self._picked(depth, 0)
 
@@ -158,7 +156,7 @@ def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box |
     the face that it sees."""
     at = np.linspace(-half, half, GRID)
 
-    def seen(x: Doubles, y: Doubles) -> NDArray[np.bool_]:
+    def seen(x: DoubleArray, y: DoubleArray) -> NDArray[np.bool_]:
         x, y = np.meshgrid(x, y)
         return ~np.isnan(_image_pixels(np.stack([x, y, np.ones_like(x)], axis=-1) @ CUBE[name], whole, lens)[0])
 
@@ -176,7 +174,7 @@ def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box |
     return (borders[0], borders[1], borders[2], borders[3]), float(coarse.mean())
 
 
-def _image_pixels(rays: Doubles, whole: Numbers, lens: Lens) -> tuple[Doubles, Doubles]:
+def _image_pixels(rays: DoubleArray, whole: Numbers, lens: Lens) -> tuple[DoubleArray, DoubleArray]:
     """Where rays (..., 3) of the camera meet the distorted image, pixel centers at +0.5; NaN where they do not."""
     width, height, fx, fy, cx, cy = whole
     u, v = lens.project(rays)
@@ -192,7 +190,7 @@ def _image_pixels(rays: Doubles, whole: Numbers, lens: Lens) -> tuple[Doubles, D
     return np.where(inside, u, np.nan), np.where(inside, v, np.nan)
 
 
-def _pixels(key: _Key) -> tuple[Doubles, Doubles]:
+def _pixels(key: _Key) -> tuple[DoubleArray, DoubleArray]:
     """(H, W) each: column and row of the distorted image that each pixel of the face shows; NaN where it has none."""
     name, (width, height, fx, fy, cx, cy), whole, lens = key
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
@@ -200,7 +198,7 @@ def _pixels(key: _Key) -> tuple[Doubles, Doubles]:
 
 
 @lru_cache(maxsize=CACHED_MAPS)
-def _nearest(key: _Key) -> NDArray[np.int32]:
+def _nearest(key: _Key) -> IntArray:
     """(H, W) int32: the nearest pixel of the distorted image, counted row by row; -1 where it has none."""
     column, row = _pixels(key)
     with np.errstate(invalid="ignore"):
@@ -209,7 +207,7 @@ def _nearest(key: _Key) -> NDArray[np.int32]:
 
 
 @lru_cache(maxsize=CACHED_MAPS // 2)
-def _remap(key: _Key) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _remap(key: _Key) -> tuple[FloatArray, FloatArray]:
     """(H, W) each: as `_pixels`, for OpenCV, which counts pixel centers at whole numbers; -2, outside of the image and
     so black, where it has none."""
     x, y = (np.nan_to_num(pixels - 0.5, nan=-2.0).astype(np.float32) for pixels in _pixels(key))

@@ -27,9 +27,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFrame, DepthImage
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.scene import Camera, Points
-
-Doubles = NDArray[np.float64]
+from og_pointcloud.scene import Camera, DoubleArray, Points
 
 SURVEYED = 16
 """Views, spread evenly, that are compared with each other before the fusion."""
@@ -219,7 +217,7 @@ def _straight(line, k):  # noqa: ANN001, ANN202
     return False
 
 
-def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) -> Doubles:
+def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) -> DoubleArray:
     """(n, 3) float64 world coordinates of the chosen pixels, row by row, their depths times ``factor``."""
     camera = image.camera
     rows, columns = np.nonzero(chosen)
@@ -231,7 +229,7 @@ def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) 
     )
 
 
-def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
+def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> DoubleArray:
     """Relative differences between depths of some pixels and what the other images measured at the same places, all
     depths taken times ``factor``."""
     found = [np.zeros(0)]
@@ -248,7 +246,7 @@ def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
     return np.concatenate(found)
 
 
-def _seen(xyz: Doubles, camera: Camera) -> tuple[NDArray[np.intp], Doubles]:
+def _seen(xyz: DoubleArray, camera: Camera) -> tuple[NDArray[np.intp], DoubleArray]:
     """Flat pixels and depths of the world points that fall into the image."""
     uv_px, depth = camera.project(xyz)
     inside = camera.shows(uv_px)
@@ -257,8 +255,8 @@ def _seen(xyz: Doubles, camera: Camera) -> tuple[NDArray[np.intp], Doubles]:
 
 
 def _judge(
-    xyz: Doubles, origin: Doubles, frames: Sequence[DepthFrame], found: Survey
-) -> tuple[NDArray[np.bool_], Doubles]:
+    xyz: DoubleArray, origin: DoubleArray, frames: Sequence[DepthFrame], found: Survey
+) -> tuple[NDArray[np.bool_], DoubleArray]:
     """(n,) bool, which points the views confirm, and (n, 3), where these then lie. xyz: relative to the origin."""
     cv2 = require_cv2()
     votes, shift = np.zeros((len(xyz), 3), np.int32), np.zeros((len(xyz), 4))
@@ -321,9 +319,9 @@ class _Voxels:
     def __init__(self, edge: float) -> None:
         self._edge = edge
         self._merged = np.zeros(0, np.int64), np.zeros((0, 7))
-        self._waiting: list[tuple[NDArray[np.int64], Doubles]] = []
+        self._waiting: list[tuple[NDArray[np.int64], DoubleArray]] = []
 
-    def add(self, xyz: Doubles, rgb: NDArray[Any], source: str) -> None:
+    def add(self, xyz: DoubleArray, rgb: NDArray[Any], source: str) -> None:
         """xyz: (n, 3), within VOXELS_ACROSS / 2 voxels of 0. rgb: (n, 3). source: of the points, for the error."""
         farthest = float(np.abs(xyz).max(initial=0.0))
         if farthest >= (VOXELS_ACROSS // 2 - 1) * self._edge:
@@ -339,7 +337,7 @@ class _Voxels:
         if sum(len(keys) for keys, _ in self._waiting) > len(self._merged[0]):
             self._merge()
 
-    def means(self) -> tuple[Doubles, Doubles]:
+    def means(self) -> tuple[DoubleArray, DoubleArray]:
         """(n, 3) positions and (n, 3) colors, in the order of the voxels."""
         self._merge()
         sums = self._merged[1]
@@ -351,7 +349,7 @@ class _Voxels:
         self._merged, self._waiting = _summed(np.concatenate(keys), np.concatenate(sums)), []
 
 
-def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], Doubles]:
+def _summed(keys: NDArray[np.int64], rows: DoubleArray) -> tuple[NDArray[np.int64], DoubleArray]:
     """The keys that occur, ascending, and the sum of each one's rows, added up in their order."""
     unique, index = np.unique(keys, return_inverse=True)
     sums = [np.bincount(index, column, len(unique)) for column in rows.T]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
-from og_pointcloud.scene import Points
+from og_pointcloud.scene import DoubleArray, FloatArray, Points
 
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): color = 0.5 + SH_CONSTANT * f_dc."""
@@ -132,7 +132,7 @@ def _compressed(elements: Elements) -> Points:
     return activated(xyz, scale, rotation, rgba[:, 3], color)
 
 
-def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> NDArray[np.float64]:
+def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> DoubleArray:
     """Fields of ``bits`` bits, the first uppermost, as (n, len(bits)) shares in [0, 1] of a field's largest value."""
     shares = np.empty((len(words), len(bits)))
     shift = sum(bits)
@@ -143,7 +143,7 @@ def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> 
     return shares
 
 
-def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.float64]) -> NDArray[np.float64]:
+def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: DoubleArray) -> DoubleArray:
     """(n, len(names)) values at ``share`` of the way from the minimum to the maximum of each splat's chunk."""
     minimum, maximum = (stack_columns(chunk, [f"{end}_{name}" for name in names]) for end in ("min", "max"))
     of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
@@ -151,7 +151,7 @@ def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.
         return minimum[of_splat] + (maximum - minimum)[of_splat] * share
 
 
-def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_smallest_three(largest: NDArray[np.integer], others: DoubleArray) -> DoubleArray:
     """(n, 4) unit quaternions. largest: (n,) place of the largest part, which is positive; others: (n, 3), the other
     parts in their order."""
     quaternions, is_largest = np.empty((len(others), 4)), np.arange(4) == largest[:, None]
@@ -161,11 +161,11 @@ def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.float64
 
 
 def activated(
-    xyz: NDArray[np.float64],
-    scale: NDArray[np.float32],
-    rotation: NDArray[np.float64],
-    opacity: NDArray[np.float64],
-    color: NDArray[np.float64] | None,
+    xyz: DoubleArray,
+    scale: FloatArray,
+    rotation: DoubleArray,
+    opacity: DoubleArray,
+    color: DoubleArray | None,
 ) -> Points:
     """Points from activated values, quaternions wxyz (n, 4) of any length, and colors around [0, 1], which are clipped.
     SceneError where a value is not finite."""

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
-from og_pointcloud.scene import Points, require_finite
+from og_pointcloud.scene import DoubleArray, Points, require_finite
 
 if TYPE_CHECKING:
     from laspy import LasData
@@ -64,7 +64,7 @@ def read_las(path: StrPath) -> Points:
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
-    xyz: list[NDArray[np.float64]] = []
+    xyz: list[DoubleArray] = []
     rgb: list[NDArray[np.uint16]] = []
     with _opened(Path(path)) as reader:
         promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
@@ -262,7 +262,7 @@ def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return (rgb if rgb.max(initial=0) <= 255 else np.rint(rgb / FULL_RANGE)).astype(np.uint8)
 
 
-def _grid(xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _grid(xyz_world: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
     """Offset and step, a power of ten, of the counts that stand for coordinates: at most 10^9 of them, which fit 32
     bits."""
     if not len(xyz_world):

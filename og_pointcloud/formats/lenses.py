@@ -21,19 +21,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, DoubleArray
 
-Doubles = NDArray[np.float64]
 Terms = Mapping[str, float]
 
 ANGLES = np.linspace(0.0, np.pi, 4097)[:-1]
 """Angles from the axis, radians, at which it is tried how far out a lens sees."""
 
 
-def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _perspective(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     z = z + t["xi"] * np.sqrt(x * x + y * y + z * z)  # the unified model; a plain pinhole for xi = 0
     x, y = x / z, y / z
     r2 = x * x + y * y
@@ -41,7 +39,7 @@ def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles,
     return _tangential(x, y, r2, radial / (1 + r2 * (t["k4"] + r2 * (t["k5"] + r2 * t["k6"]))), t)
 
 
-def _fisheye(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _fisheye(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     # (x, y) to the length theta; on the axis both are 0, whatever the scale.
     radius = np.hypot(x, y)
     scale = np.arctan2(radius, z) / np.maximum(radius, np.finfo(np.float64).tiny)
@@ -52,7 +50,9 @@ def _fisheye(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Dou
     return x + t["sx1"] * r2, y + t["sy1"] * r2
 
 
-def _tangential(x: Doubles, y: Doubles, r2: Doubles, radial: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _tangential(
+    x: DoubleArray, y: DoubleArray, r2: DoubleArray, radial: DoubleArray, t: Terms
+) -> tuple[DoubleArray, DoubleArray]:
     """Brown's decentering on top of the radial factor, in OpenCV's order of p1 and p2."""
     p1, p2 = t["p1"], t["p2"]
     return (
@@ -61,30 +61,30 @@ def _tangential(x: Doubles, y: Doubles, r2: Doubles, radial: Doubles, t: Terms) 
     )
 
 
-def _fov(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _fov(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     radius = np.hypot(x, y)
     bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]  # arctan2: rays to the side and behind too
     scale = bent / np.maximum(radius, np.finfo(np.float64).tiny)
     return x * scale, y * scale
 
 
-def _division(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _division(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     x, y = x / z, y / z
     # r = d / (1 + k d^2) solved for d, the root that is r for k = 0; in this form it holds there, too.
     scale = 2 / (1 + np.sqrt(1 - 4 * t["k"] * (x * x + y * y)))
     return x * scale, y * scale
 
 
-def _extended(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+def _extended(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     depth = t["alpha"] * np.sqrt(t["beta"] * (x * x + y * y) + z * z) + (1 - t["alpha"]) * z
     return x / depth, y / depth
 
 
-def _spherical(x: Doubles, y: Doubles, z: Doubles, _: Terms) -> tuple[Doubles, Doubles]:
+def _spherical(x: DoubleArray, y: DoubleArray, z: DoubleArray, _: Terms) -> tuple[DoubleArray, DoubleArray]:
     return np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
 
 
-Projection = Callable[[Doubles, Doubles, Doubles, Terms], tuple[Doubles, Doubles]]
+Projection = Callable[[DoubleArray, DoubleArray, DoubleArray, Terms], tuple[DoubleArray, DoubleArray]]
 MODELS: dict[str, tuple[tuple[str, ...], Projection]] = {
     "perspective": (("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "r8", "xi"), _perspective),
     "fisheye": (("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"), _fisheye),
@@ -108,7 +108,7 @@ class Lens:
         """Whether the image's left border continues at the right."""
         return self.model == "spherical"
 
-    def project(self, rays: Doubles) -> tuple[Doubles, Doubles]:
+    def project(self, rays: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
         """Normalised coordinates (...) of rays (..., 3) of any length; NaN for rays that the lens does not see."""
         x, y, z = np.moveaxis(np.asarray(rays, np.float64), -1, 0)
         with np.errstate(all="ignore"):
@@ -122,7 +122,7 @@ class Lens:
         u, _ = self.project(np.array([np.sin(angle), 0.0, np.cos(angle)]))
         return np.inf if self.wraps or np.isnan(u) else float(u)
 
-    def _normalized(self, x: Doubles, y: Doubles, z: Doubles) -> tuple[Doubles, Doubles]:
+    def _normalized(self, x: DoubleArray, y: DoubleArray, z: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
         names, projection = MODELS[self.model]
         return projection(x, y, z, dict(zip(names, self.terms, strict=True)))
 
@@ -165,7 +165,7 @@ def lens_of(model: str, values: Terms) -> Lens | None:
     return lens
 
 
-def spherical_camera(width: int, height: int, world_to_camera: Doubles) -> Camera:
+def spherical_camera(width: int, height: int, world_to_camera: DoubleArray) -> Camera:
     """The camera of an equirectangular image, all of the sphere: its focal lengths are pixels a radian."""
     if not 1.9 < width / max(height, 1) < 2.1:
         raise SceneError(

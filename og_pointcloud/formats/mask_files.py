@@ -23,7 +23,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
 from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.formats.poses import read_json_object
-from og_pointcloud.scene import NOT_SEEN, CutMasks
+from og_pointcloud.scene import NOT_SEEN, CutMasks, FloatArray, IntArray
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
@@ -45,8 +45,8 @@ class MaskLayer:
     """
 
     size: tuple[int, int]
-    features: NDArray[np.float32]
-    read: Callable[[], NDArray[np.int32]]
+    features: FloatArray
+    read: Callable[[], IntArray]
     tracks: NDArray[np.integer] | None = None
     cut_from: CutMasks | None = None
 
@@ -100,7 +100,7 @@ def _id_header(file: Path) -> PngHeader:
     return header
 
 
-def read_ids(file: Path) -> NDArray[np.int32]:
+def read_ids(file: Path) -> IntArray:
     """A mask image, (H, W) int32: -1 outside every mask, else the row of the features (the stored id less 1)."""
     has_palette = _id_header(file).color_type == PALETTE  # OpenCV would give colors instead of ids
     ids = palette_indices(file) if has_palette else decoded(file, require_cv2().IMREAD_UNCHANGED)
@@ -109,9 +109,7 @@ def read_ids(file: Path) -> NDArray[np.int32]:
     return ids.astype(np.int32) - 1
 
 
-def _read_features(
-    file: Path, names: Sequence[str]
-) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[Any]], str]:
+def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]], str]:
     """Features and tracks by view name, and the name of the features' space."""
     of_tracks = {name + TRACKS: name for name in names}
     expected = "an array (masks, D) under each image's stem"
@@ -121,7 +119,7 @@ def _read_features(
     return features, tracks, str(arrays.get("feature_space", UNKNOWN_SPACE))
 
 
-def rows_shown(ids: NDArray[np.int32], count: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+def rows_shown(ids: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
     """(u,) which of ``count`` rows of features an id map shows, ascending; and (count + 2,) the place of each row among
     these, to be indexed by ids: -1 for rows that are left out, and -1 and NOT_SEEN, its last two, for themselves."""
     used = np.flatnonzero(np.bincount(ids[ids >= 0], minlength=1))
@@ -131,7 +129,7 @@ def rows_shown(ids: NDArray[np.int32], count: int) -> tuple[NDArray[np.intp], ND
     return used, place
 
 
-def as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:
+def as_features(values: NDArray[Any], source: str) -> FloatArray:
     """(masks, width) float32 of what a file holds. Values beyond float32 become infinite, which the scene reports by
     mask. SceneError, which begins with ``source``, for anything but floats of that shape."""
     if values.size == 0:

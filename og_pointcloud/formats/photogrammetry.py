@@ -21,15 +21,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
 from og_pointcloud.formats.poses import LARGEST, OPENGL, PosedFrames, PosedImage, inverse, rigid
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, DoubleArray
 
-Doubles = NDArray[np.float64]
 ImageSize = Callable[[str], tuple[int, int]]
 
 MAX_BYTES = 1 << 28
@@ -121,7 +119,7 @@ def _chunk(chunk: ElementTree.Element) -> tuple[list[PosedImage], list[str]]:
     return images, dropped
 
 
-World = tuple[float, Doubles, Doubles]
+World = tuple[float, DoubleArray, DoubleArray]
 """Scale, rotation, translation: world = scale * rotation @ chunk + translation."""
 
 
@@ -137,7 +135,7 @@ def _world_of(element: ElementTree.Element) -> World | None:
     )
 
 
-def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: Doubles, world: World) -> PosedImage:
+def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleArray, world: World) -> PosedImage:
     scale, rotation, translation = world
     with np.errstate(all="ignore"):  # the camera refuses what comes of it
         pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
@@ -176,7 +174,7 @@ def _metashape_lens(kind: str, terms: dict[str, float]) -> Lens | None:
     return lens_of("perspective", terms)
 
 
-def _floats(element: ElementTree.Element, count: int) -> Doubles:
+def _floats(element: ElementTree.Element, count: int) -> DoubleArray:
     words = (element.text or "").split()
     try:
         values = np.array([float(word) for word in words[: count + 1]])
@@ -243,7 +241,7 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
     return values
 
 
-def _looking_down(heading: float, pitch: float, roll: float) -> Doubles:
+def _looking_down(heading: float, pitch: float, roll: float) -> DoubleArray:
     """(3, 3) camera to world, OpenGL axes, world x east, y north, z up. Degrees; heading is clockwise from north. At 0
     OpenGL's axes are the world's: the camera looks along -z, down, with its y to the north."""
     (sy, sp, sr), (cy, cp, cr) = (wave(np.radians([-heading, pitch, roll])) for wave in (np.sin, np.cos))

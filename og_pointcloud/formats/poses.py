@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
@@ -20,7 +20,7 @@ from og_pointcloud.formats.faces import Face, faces
 from og_pointcloud.formats.images import IMAGE_SUFFIXES
 from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, DoubleArray
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 LARGEST = 1e30
@@ -68,11 +68,11 @@ class Sensor:
     unit: float | None = None
 
     @classmethod
-    def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> Sensor:
+    def from_matrix(cls, size: tuple[int, int], matrix: DoubleArray) -> Sensor:
         """From intrinsics (3 or 4, 3 or 4) that count pixel centers at whole numbers, as most RGB-D sets do."""
         return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
 
-    def at(self, camera_to_world: NDArray[np.float64]) -> Camera:
+    def at(self, camera_to_world: DoubleArray) -> Camera:
         """The camera there; camera_to_world: (3 or 4, 4), finite, OpenCV axes."""
         if camera_to_world.shape not in ((3, 4), (4, 4)):
             raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
@@ -90,7 +90,7 @@ class RecordedFrame:
 
     path: str
     source: Path | str
-    pose: NDArray[np.float64] | None = None
+    pose: DoubleArray | None = None
     color: Sensor | None = None
     depth: tuple[Sensor, Path] | None = None
 
@@ -125,7 +125,7 @@ def in_pinholes(image: PosedImage) -> tuple[PosedImage, ...]:
     )
 
 
-def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
+def rigid(rotation: DoubleArray, translation: DoubleArray) -> DoubleArray:
     """The (4, 4) transform x -> rotation @ x + translation."""
     transform = np.eye(4)
     transform[:3, :3] = rotation
@@ -133,14 +133,14 @@ def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ND
     return transform
 
 
-def inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse(transform: DoubleArray) -> DoubleArray:
     """(4, 4) inverse of a rigid transform (3 or 4, 4)."""
     rotation = transform[:3, :3].T
     with np.errstate(over="ignore", invalid="ignore"):  # `Camera` refuses what absurd numbers become
         return rigid(rotation, -rotation @ transform[:3, 3])
 
 
-def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
+def rotation_of_quaternion(wxyz: ArrayLike) -> DoubleArray:
     """(3, 3) rotation matrix, for column vectors, of a unit quaternion w x y z (Hamilton)."""
     w, x, y, z = np.asarray(wxyz, np.float64)
     return np.array(
@@ -152,7 +152,7 @@ def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
+def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> DoubleArray:
     """(4, 4) of a quaternion w x y z of any length, and a translation (3,); SceneError where there is no rotation."""
     quaternion, shift = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
     length = math.hypot(*quaternion)
@@ -161,7 +161,7 @@ def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> NDArray[np.fl
     return rigid(rotation_of_quaternion(quaternion / length), shift)
 
 
-def rotation_of_vector(radians: ArrayLike) -> NDArray[np.float64]:
+def rotation_of_vector(radians: ArrayLike) -> DoubleArray:
     """(3, 3) rotation about a vector (3,) by its length; NaN where that is not finite."""
     half = np.asarray(radians, np.float64) / 2
     with np.errstate(over="ignore", invalid="ignore"):
@@ -170,7 +170,7 @@ def rotation_of_vector(radians: ArrayLike) -> NDArray[np.float64]:
         return rotation_of_quaternion([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
 
-def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_of(rotation: DoubleArray) -> DoubleArray:
     """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
     # 4 q q': row i is the quaternion times four times its part i. The row of the largest part divides safely.
@@ -186,7 +186,7 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
 
 
-def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def upright_axes(up: DoubleArray) -> DoubleArray:
     """(3, 3) right-handed orthonormal rows, the third of which is a unit vector up."""
     # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
@@ -194,7 +194,7 @@ def upright_axes(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray([aside, np.cross(up, aside), up], np.float64)
 
 
-def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:
+def in_local_frame(camera: Camera, origin: DoubleArray) -> Camera:
     """The camera seen from local coordinates, world = local + origin.
 
     R (local + origin) + t = R local + (R origin + t): in float64, so that an offset of 1e6 costs under 1e-9.
@@ -255,7 +255,7 @@ def read_text(file: Path, most: int = MAX_TEXT_BYTES) -> str:
         raise SceneError(f"{file} cannot be read as text ({error!s:.80}): export it again") from None
 
 
-def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
+def read_numbers(file: Path, columns: int) -> DoubleArray:
     """(rows, columns) float64 of a text file of numbers, ``nan`` and ``inf`` among them."""
     rows = [line.split() for line in read_text(file).splitlines() if line.strip()]
     try:

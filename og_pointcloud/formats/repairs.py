@@ -45,9 +45,7 @@ from og_pointcloud.formats.poses import (
     rotation_of_quaternion,
     rotation_of_vector,
 )
-from og_pointcloud.scene import Camera
-
-Doubles = NDArray[np.float64]
+from og_pointcloud.scene import Camera, DoubleArray, IntArray
 
 REPAIRS_NAME = "repairs.json"
 MOST_REPAIRS = 16
@@ -166,7 +164,7 @@ def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> l
     return repaired
 
 
-def _read_repaired(read: Callable[[], NDArray[np.int32]], value: str) -> NDArray[np.int32]:
+def _read_repaired(read: Callable[[], IntArray], value: str) -> IntArray:
     ids = read()
     return np.where(ids < 0, ids, ids + 1) if value == "from-zero" else np.ascontiguousarray(MASK_FLIPS[value](ids))
 
@@ -187,18 +185,18 @@ def _each(change: Callable[[Camera, Repair], Camera]) -> Change:
     return lambda cameras, repair: [change(camera, repair) for camera in cameras]
 
 
-def _each_pose(change: Callable[[Doubles, Repair], Doubles]) -> Change:
+def _each_pose(change: Callable[[DoubleArray, Repair], DoubleArray]) -> Change:
     """Of world_to_camera, (4, 4)."""
     return _each(lambda camera, repair: replace(camera, world_to_camera=change(camera.world_to_camera, repair)))
 
 
-def _with_xyzw(pose: Doubles, repair: Repair) -> Doubles:
+def _with_xyzw(pose: DoubleArray, repair: Repair) -> DoubleArray:
     """The pose whose quaternion, stored as x y z w, was read as w x y z. It is known from the rotation up to its sign,
     which does not matter: q and -q are one rotation."""
     return rigid(rotation_of_quaternion(np.roll(quaternion_of(pose[:3, :3]), 1)), pose[:3, 3])
 
 
-def _with_axes(pose: Doubles, repair: Repair) -> Doubles:
+def _with_axes(pose: DoubleArray, repair: Repair) -> DoubleArray:
     """x of the poses' world is the named axis of the cloud's, and so on."""
     turn = np.eye(4)
     for row, axis in enumerate(repair.value.split(",")):

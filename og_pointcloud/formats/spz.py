@@ -24,10 +24,9 @@ from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Points
+from og_pointcloud.scene import DoubleArray, IntArray, Points
 
 Bytes = NDArray[np.uint8]
-Doubles = NDArray[np.float64]
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
@@ -174,14 +173,14 @@ def _byte(values: NDArray[np.floating]) -> Bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def _fixed_point(parts: Bytes) -> NDArray[np.int32]:
+def _fixed_point(parts: Bytes) -> IntArray:
     """(...) whole numbers with a sign, of three bytes (..., 3) each, the lowest first."""
     # Flipping the sign bit and taking it off again extends the sign from 24 to 32 bits.
     low, middle, high = np.moveaxis(parts.astype(np.int32), -1, 0)
     return ((low | middle << 8 | high << 16) ^ FIXED_POINT) - FIXED_POINT
 
 
-def _as_fixed_point(xyz: Doubles) -> tuple[Bytes, int]:
+def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
     """(n, 9) bytes, and how many of their bits are fractions: as many as the coordinate farthest from 0 leaves."""
     farthest = float(np.abs(xyz).max(initial=0.0))
     bits = MOST_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((FIXED_POINT - 1) / farthest)))
@@ -195,13 +194,13 @@ def _as_fixed_point(xyz: Doubles) -> tuple[Bytes, int]:
     return np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8).reshape(-1, 9), bits
 
 
-def _three_bytes(rotation: Bytes) -> Doubles:
+def _three_bytes(rotation: Bytes) -> DoubleArray:
     """(n, 4) quaternions x y z w of version 2, whose w is what is missing to 1."""
     xyz = rotation.reshape(-1, 3) / 127.5 - 1
     return np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1)))])
 
 
-def _smallest_three(words: NDArray[np.uint32]) -> Doubles:
+def _smallest_three(words: NDArray[np.uint32]) -> DoubleArray:
     """(n, 4) quaternions x y z w: two bits name the largest part, which is positive. The others, at most 1/sqrt(2),
     have nine bits and a sign each; the last one is lowest."""
     fields = words[:, None] >> PLACES
@@ -209,7 +208,7 @@ def _smallest_three(words: NDArray[np.uint32]) -> Doubles:
     return from_smallest_three(words >> 30, np.where(fields >> 9 & 1, -size, size))
 
 
-def _packed_rotation(wxyz: Doubles) -> NDArray[np.uint32]:
+def _packed_rotation(wxyz: DoubleArray) -> NDArray[np.uint32]:
     """(n,) words that `_smallest_three` reads, of unit quaternions with the scene's axes."""
     xyzw = np.column_stack([wxyz[:, 1:] * TURNED, wxyz[:, 0]])
     largest = np.abs(xyzw).argmax(axis=1)

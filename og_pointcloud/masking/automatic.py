@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.scene import FloatArray
 
 Masks = NDArray[np.bool_]
-Floats = NDArray[np.float32]
 
 
 class PointPredictor(Protocol):
@@ -27,7 +27,7 @@ class PointPredictor(Protocol):
         """Encode (H, W, 3) uint8 RGB, once for all prompts."""
         ...
 
-    def at_points(self, points: Floats) -> tuple[Floats, Floats]:
+    def at_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """points (k, 2) -> logits (k, m, h, w) of the m masks that each may mean, at the model's own size without
         padding, so that they cover the image; and predicted IoU (k, m)."""
         ...
@@ -69,7 +69,7 @@ class AutomaticMasks:
         kept_whole = best_of_alike(masks, scores[best], self.same_box)  # again: specks had made boxes larger
         return Proposals(masks[kept_whole], scores[best][kept_whole])
 
-    def _good(self, logits: Floats, iou: Floats) -> tuple[Floats, Floats]:
+    def _good(self, logits: FloatArray, iou: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Those of the answers (k, m, h, w) and (k, m) to a batch that are good: (n, h, w), and their scores (n,)."""
         logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
         good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
@@ -77,20 +77,20 @@ class AutomaticMasks:
         return logits[good], np.clip(iou[good], 0, 1)
 
 
-def grid(per_side: int, width: int, height: int) -> Floats:
+def grid(per_side: int, width: int, height: int) -> FloatArray:
     """(per_side^2, 2) points x, y in the middles of equal cells."""
     at = (np.arange(per_side) + 0.5) / per_side
     return np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def stability(logits: Floats, offset: float) -> Floats:
+def stability(logits: FloatArray, offset: float) -> FloatArray:
     """(n,): IoU of each mask (n, h, w) at a stricter and at a laxer threshold; 0 where both are empty."""
     strict = (logits > offset).sum(axis=(1, 2))
     lax = (logits > -offset).sum(axis=(1, 2))
     return (strict / np.maximum(lax, 1)).astype(np.float32)
 
 
-def best_of_alike(masks: Masks, scores: Floats, same: float) -> NDArray[np.intp]:
+def best_of_alike(masks: Masks, scores: FloatArray, same: float) -> NDArray[np.intp]:
     """Non-maximum suppression of masks (n, h, w) by their boxes: indices, best score first, of those with a score above
     0 whose box has an IoU above ``same`` with that of no better one."""
     cv2 = require_cv2()

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.scene import DoubleArray, IntArray
 
 PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
 """Level -> weight of the value of a mask's parts beside its own: more prefers parts, less prefers wholes."""
@@ -27,7 +28,7 @@ VISIBLE = 0.3
 """A mask of which better ones leave less than this share is left out."""
 
 
-def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+def settled(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[np.intp]]:
     """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first; and
     (K,) the proposal that each id is."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
@@ -44,7 +45,7 @@ def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArra
     return ids.astype(np.int32)[atom_of_pixel], order[kept][shown[shown >= 0]]
 
 
-def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:
+def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], DoubleArray]:
     """(H, W) the atom of each pixel; (M, atoms) which masks cover each atom; (atoms,) its pixels."""
     # Each mask is a random number, a set of masks their sum: two sets have one sum once in 2^63 draws or so.
     rng = np.random.default_rng(0)
@@ -56,7 +57,7 @@ def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_
     return atom_of_pixel.reshape(masks.shape[1:]), member, area_px.astype(np.float64)
 
 
-def _distinct(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
+def _distinct(shared_px: DoubleArray) -> NDArray[np.intp]:
     """Rows of the masks, which are best first, without empty ones and those that nearly coincide with one before."""
     area_px = np.diag(shared_px)
     kept: list[int] = []
@@ -67,7 +68,7 @@ def _distinct(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.array(kept, np.intp)
 
 
-def _parents(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
+def _parents(shared_px: DoubleArray) -> NDArray[np.intp]:
     """(M,) the smallest larger mask that each lies in, -1 for none."""
     area_px = np.diag(shared_px)
     parent = np.full(len(area_px), -1)
@@ -78,9 +79,7 @@ def _parents(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
     return parent
 
 
-def _cut(
-    area_px: NDArray[np.float64], scores: NDArray[np.float64], parent: NDArray[np.intp], preference: float
-) -> NDArray[np.intp]:
+def _cut(area_px: DoubleArray, scores: DoubleArray, parent: NDArray[np.intp], preference: float) -> NDArray[np.intp]:
     """The masks of one level, best first: none lies inside another in the forest. A whole that ties with its parts is
     used."""
     # parts: best value that a mask's children can make together. Children come first, as they are smaller.
@@ -99,7 +98,7 @@ def _cut(
     return np.flatnonzero(used)
 
 
-def _owners(member: NDArray[np.bool_], area_px: NDArray[np.float64], used: NDArray[np.intp]) -> NDArray[np.intp]:
+def _owners(member: NDArray[np.bool_], area_px: DoubleArray, used: NDArray[np.intp]) -> NDArray[np.intp]:
     """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
     owner = np.full(member.shape[1], -1)
     for mask in used[::-1]:  # the best last, so that it has what it shares

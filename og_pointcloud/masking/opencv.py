@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 
-Labels = NDArray[np.int32]
-Floats = NDArray[np.float64]
-Pairs = tuple[Labels, Labels, Floats]
+Labels = IntArray
+Pairs = tuple[Labels, Labels, DoubleArray]
 
 WORKING_SIDE = 480
 """Pixels of the longer side at which regions are found; more finds texture, not things."""
@@ -92,9 +92,9 @@ class RegionTree:
 
     superpixels: Labels
     parent: Labels
-    made: Floats
-    gone: Floats
-    area: Floats
+    made: DoubleArray
+    gone: DoubleArray
+    area: DoubleArray
 
     def runs(self) -> tuple[Labels, Labels]:
         """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
@@ -113,7 +113,7 @@ class RegionTree:
             free[above] += size[region]
         return first[:leaves], np.stack([first, first + size], axis=1)
 
-    def lasting(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    def lasting(self) -> tuple[NDArray[np.intp], FloatArray]:
         """Regions worth a proposal, best first, and their scores in [0, 1)."""
         gone = np.minimum(self.gone, 1.5 * self.made.max())  # as if a root were merged away a little later
         share = self.area / self.superpixels.size
@@ -168,7 +168,7 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
     return RegionTree(superpixels, parent, made, np.where(parent >= 0, made[parent], np.inf), area)
 
 
-def _superpixels(lab: NDArray[np.float32]) -> Labels:
+def _superpixels(lab: FloatArray) -> Labels:
     """(H, W) int32, 0..n-1: graph segments cut by compact cells."""
     cv2 = require_cv2()
     if not hasattr(cv2, "ximgproc"):
@@ -190,11 +190,11 @@ class _Borders:
 
     a: NDArray[np.integer]
     b: NDArray[np.integer]
-    length: Floats
-    contrast: Floats
+    length: DoubleArray
+    contrast: DoubleArray
 
     @classmethod
-    def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Borders:
+    def of(cls, labels: Labels, lab: FloatArray) -> _Borders:
         across, down = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))
         a, b = np.concatenate([across[0], down[0]]), np.concatenate([across[1], down[1]])
         contrast = np.concatenate([across[2], down[2]])
@@ -211,13 +211,13 @@ class _Borders:
         return _Borders(pair // count, pair % count, length, contrast)
 
 
-def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
+def _sums(labels: NDArray[np.integer], values: DoubleArray) -> DoubleArray:
     """(groups, c): sums of the rows of ``values`` (k, c) with the same label."""
     count = int(labels.max(initial=-1)) + 1
     return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1).astype(np.float64)
 
 
-def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
+def _pixel_pairs(labels: Labels, lab: FloatArray) -> Pairs:
     """For the p pixels whose right neighbor is of another region: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)
@@ -225,7 +225,7 @@ def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
     return labels[row, column], labels[row, column + 1], contrast
 
 
-def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
+def _distances(regions: DoubleArray, borders: _Borders, pixels: int) -> DoubleArray:
     """(e,) distance of the two regions of each border. regions: (n, 7) number of pixels, sums of colors, and of their
     squares."""
     a, b, area = borders.a, borders.b, regions[:, 0]
@@ -238,7 +238,7 @@ def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
     return color * np.sqrt(share / (share + SMALL_REGION))
 
 
-def _nearest_pairs(borders: _Borders, distance: Floats, count: int) -> NDArray[np.intp]:
+def _nearest_pairs(borders: _Borders, distance: DoubleArray, count: int) -> NDArray[np.intp]:
     """Borders whose two regions are each other's nearest, and of these only the nearest third, at least one: so the
     order of mergers stays close to that of merging the nearest pair each time."""
     # By ranks, which have no ties.

@@ -37,6 +37,7 @@ from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.formats.tables import naming, positions
+from og_pointcloud.scene import DoubleArray, IntArray
 from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
 
@@ -210,9 +211,7 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
     return tuple(int(k) for k in dict.fromkeys(ids))
 
 
-def _ids_of_points(
-    scene: LabelledScene, xyz: NDArray[np.float64], cloud: StrPath | None
-) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None) -> tuple[IntArray, tuple[str, ...]]:
     """Instance id of each point of the cloud: the scene's own where it is the same cloud, else the nearest point's."""
     if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_PLACE * scene.cloud.spacing).all():
         return scene.instance_ids, ()
@@ -230,7 +229,7 @@ def _ids_of_points(
 
 
 def _halo(
-    scene: LabelledScene, xyz: NDArray[np.float64], ids: NDArray[np.int32], chosen: NDArray[np.bool_], halo: float
+    scene: LabelledScene, xyz: DoubleArray, ids: IntArray, chosen: NDArray[np.bool_], halo: float
 ) -> NDArray[np.bool_]:
     """(n,) bool, points of no instance that lie within ``halo`` spacings of a chosen one."""
     local = (xyz - scene.cloud.origin).astype(np.float32)
@@ -281,7 +280,7 @@ def _read(path: Path) -> _Cloud:
     return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
 
 
-def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray]:
     """Rotation (3, 3), scale and translation (3,) of a pose."""
     matrix = pose_matrix(np.eye(4) if pose is None else pose)
     determinant = float(np.linalg.det(matrix[:3, :3]))

@@ -20,6 +20,7 @@ from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, 
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.poses import quaternion_of
 from og_pointcloud.formats.tables import colors, positions, stack_columns
+from og_pointcloud.scene import DoubleArray
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -34,7 +35,7 @@ MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
 
 
-def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]) -> Rows:
+def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows:
     """The rows with those chosen in another color, as harmonics, as red green blue, or both; a plain cloud without
     colors becomes gray. color: (3,), 0 to 1; the mean of the object becomes that color, its light and dark stay."""
     columns, rgb = _columns(rows), colors(rows)
@@ -54,9 +55,7 @@ def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]
     return join_columns(columns)
 
 
-def placed(
-    rows: Rows, rotation: NDArray[np.float64], scale: float, translation: NDArray[np.float64]
-) -> tuple[Rows, tuple[str, ...]]:
+def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleArray) -> tuple[Rows, tuple[str, ...]]:
     """The rows in another frame, x -> scale * rotation @ x + translation; and what could not follow.
 
     Positions become float64. Normals, rotations and scales of Gaussians and their harmonics follow.
@@ -101,13 +100,13 @@ def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
     return columns | dict(zip(RGB, rgb.T, strict=True))
 
 
-def _color_map(base: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:
+def _color_map(base: DoubleArray, color: DoubleArray) -> DoubleArray:
     """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color, so that their mean becomes
     that color."""
     return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK)
 
 
-def _turned(turn: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turned(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
     """(n, 4) quaternions wxyz times a turn from the left (Hamilton); their lengths, which mean nothing, stay."""
     quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
     (a, b, c, d), (w, x, y, z) = turn, quaternions.T
@@ -153,7 +152,7 @@ def _rest_names(rows: Rows) -> list[str]:
     return names
 
 
-def _rest(rows: Rows) -> NDArray[np.float64]:
+def _rest(rows: Rows) -> DoubleArray:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
     values = stack_columns(rows, _rest_names(rows))
     return values.reshape(len(values), 3, values.shape[1] // 3)
@@ -162,7 +161,7 @@ def _rest(rows: Rows) -> NDArray[np.float64]:
 # Harmonics --------------------------------------------------------------------------------------------------------
 
 
-def rotated_harmonics(rest: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotated_harmonics(rest: DoubleArray, rotation: DoubleArray) -> DoubleArray:
     """Coefficients of splats that are turned by a rotation (3, 3) of column vectors.
 
     rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant. The same shape comes back.
@@ -179,7 +178,7 @@ def rotated_harmonics(rest: NDArray[np.float64], rotation: NDArray[np.float64]) 
     return turned
 
 
-def _harmonics(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+def _harmonics(directions: DoubleArray, degree: int) -> DoubleArray:
     """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree, but for one factor."""
     x, y, z = directions.T
     if degree == 1:

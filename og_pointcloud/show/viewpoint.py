@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.formats.poses import rigid, upright_axes
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, DoubleArray
 
 FOCAL = 1.7
 """Focal length in half heights of the picture: a view angle of 61 degrees."""
@@ -29,11 +29,11 @@ FILLED = 0.9
 class Viewpoint:
     """eye, target, up: (3,) float64, world coordinates; up is a unit vector."""
 
-    eye: NDArray[np.float64]
-    target: NDArray[np.float64]
-    up: NDArray[np.float64]
+    eye: DoubleArray
+    target: DoubleArray
+    up: DoubleArray
 
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> DoubleArray:
         """(3, 3), rows right, up and forward of the picture."""
         back = (self.eye - self.target) / np.linalg.norm(self.eye - self.target)
         right = np.cross(self.up, back)
@@ -47,7 +47,7 @@ class Viewpoint:
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
 
-def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: NDArray[np.float64]) -> Viewpoint:
+def choose_viewpoint(xyz: DoubleArray, labelled: NDArray[np.bool_], up: DoubleArray) -> Viewpoint:
     """xyz: (n, 3), n >= 1, finite. labelled: (n,), points that should be seen; all, if none is. up: (3,) unit."""
     sample = np.linspace(0, len(xyz) - 1, min(len(xyz), SAMPLE)).astype(np.int64)
     points, wanted = xyz[sample], labelled[sample] if labelled.any() else np.ones(len(sample), bool)
@@ -68,7 +68,7 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
     return _framed(points[inside] if inside.any() else points, best)
 
 
-def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
+def _framed(points: DoubleArray, view: Viewpoint) -> Viewpoint:
     """The same direction and target from as near as possible with all points still in the picture."""
     axes, distance = view.axes(), float(np.linalg.norm(view.eye - view.target))
     x, y, behind = axes @ (points - view.target).T
@@ -77,7 +77,7 @@ def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
     return Viewpoint(view.target - max(nearest, 0.1 * distance) * axes[2], view.target, view.up)
 
 
-def _in_sight(points: NDArray[np.float64], wanted: NDArray[np.bool_], view: Viewpoint) -> int:
+def _in_sight(points: DoubleArray, wanted: NDArray[np.bool_], view: Viewpoint) -> int:
     """Cells of a coarse picture whose nearest point is a wanted one."""
     camera = view.camera(*CELLS, FOCAL * CELLS[1] / 2)
     uv_px, depth = camera.project(points)
