@@ -16,7 +16,8 @@ transformers = pytest.importorskip("transformers")
 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
-from og_pointcloud.masking.sam import SamPredictor, open_sam, prepared, scaled_size  # noqa: E402
+from og_pointcloud.masking.automatic import AutomaticMasks  # noqa: E402
+from og_pointcloud.masking.sam import SamPredictor, prepared, scaled_size  # noqa: E402
 
 KINDS = ("sam", "sam_hq", "sam2", "sam3")
 PROMPT = {"hidden_size": 32, "mask_input_channels": 4}
@@ -150,9 +151,7 @@ def test_colours_without_a_file_are_the_familys(folders):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_proposes_masks_of_the_images_size(folders, image, kind):
-    from dataclasses import replace
-
-    proposer = replace(open_sam(folders[kind]), points_per_side=4, batch=5, least_iou=-9, least_stability=0)
+    proposer = AutomaticMasks(SamPredictor(folders[kind]), points_per_side=4, batch=5, least_iou=-9, least_stability=0)
     proposals = proposer.propose(image)
     assert proposals.masks.shape[1:] == (36, 60)
     assert len(proposals) > 0

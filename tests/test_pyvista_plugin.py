@@ -220,6 +220,10 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
     mesh = pv.PolyData(scene.xyz)
     with pytest.raises(og.OgPointcloudError, match="no point array 'og_label'"):
         plotter.og.add_segmentation(mesh)
+    with pytest.raises(og.OgPointcloudError, match="no point array 'og_label'"):
+        plotter.og.show_labelled(mesh)
+    with pytest.raises(og.OgPointcloudError, match="up is"):
+        plotter.og.show_labelled(mesh.og.segment(["pear"], scene), up=(0, 0, 0))
     with pytest.raises(og.OgPointcloudError, match="expected 'label' or 'instance'"):
         plotter.og.add_segmentation(mesh, by="colour")
     with pytest.raises(og.OgPointcloudError, match=r"0 points.*cannot be drawn"):

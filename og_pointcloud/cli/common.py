@@ -166,12 +166,6 @@ def check_at_least(option: str, value: float | None, least: float) -> None:
         raise OgPointcloudError(f"{option} is {value}; expected at least {least}")
 
 
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    from og_pointcloud.formats.atomic import write_file
-
-    write_file(path, json.dumps(value, indent=2, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
-
-
 def require_room() -> None:
     # The room's modules import these as they please: whoever lacks one needs the whole extra.
     for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):

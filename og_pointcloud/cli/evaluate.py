@@ -20,9 +20,9 @@ from og_pointcloud.cli.common import (
     names_in,
     print_table,
     replaceable,
-    write_json,
 )
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import write_json
 
 if TYPE_CHECKING:
     import numpy as np

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, get_args, get_type_hints
 
 import og_pointcloud as og
 from og_pointcloud.cli import common
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+from og_pointcloud.formats.atomic import write_json
 from og_pointcloud.journal import Journal
 from og_pointcloud.settings import FitSettings, PaperSettings
 

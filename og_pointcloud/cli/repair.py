@@ -8,8 +8,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import write_json
 
 
 def add(parser: Parser) -> None:

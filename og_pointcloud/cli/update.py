@@ -9,7 +9,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, write_fit, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, write_fit
+from og_pointcloud.formats.atomic import write_json
 from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import glob
+import json
 import os
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, BinaryIO, TypeAlias
+from typing import IO, Any, BinaryIO, TypeAlias
 
 from og_pointcloud.errors import OgPointcloudError
 
@@ -65,6 +67,12 @@ def write_file(path: StrPath, data: bytes) -> Path:
     return Path(path)
 
 
+def write_json(path: StrPath, value: Mapping[str, Any]) -> Path:
+    """Write a JSON file as people read it, whole or not at all; returns its path."""
+    text = json.dumps(value, indent=2, ensure_ascii=False)
+    return write_file(path, text.encode(errors="backslashreplace") + b"\n")
+
+
 @contextmanager
 def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """The path of a folder to make and to fill, which becomes ``path`` when, and only when, the block ends without an
@@ -72,7 +80,7 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # What killed runs have left: nobody holds its lock.
-    for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         if old.is_dir() and not old.is_symlink():
             with suppress(OgPointcloudError), locked(old):
                 shutil.rmtree(old, ignore_errors=True)
@@ -153,14 +161,9 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
 
 
-def _glob_name(path: Path) -> str:
-    """The name as a glob pattern that matches it alone."""
-    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in path.name)
-
-
 def _remove_stale(path: Path) -> None:
     """Temporary files of this path that nobody writes any more."""
-    for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         with suppress(OSError):
             if not old.is_symlink() and old.is_file() and time.time() - old.stat().st_mtime > STALE_S:
                 with old.open("rb") as file:

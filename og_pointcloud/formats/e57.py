@@ -9,7 +9,6 @@ file's checksums.
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, naming_extra
-from og_pointcloud.formats.atomic import StrPath, write_file
+from og_pointcloud.formats.atomic import StrPath, write_file, write_json
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import LARGEST, pose_of_quaternion
@@ -85,8 +84,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
             why = unused[0] if unused else "the file has no images"
             raise SceneError(f"no image of it can be used ({why}); expected pinhole or spherical ones with poses")
     write_ply(folder / "points.ply", {"vertex": plain_rows(points.xyz_world, points.rgb)})
-    content = {"ply_file_path": "points.ply", "frames": frames}
-    write_file(folder / "transforms.json", json.dumps(content, indent=1).encode())
+    write_json(folder / "transforms.json", {"ply_file_path": "points.ply", "frames": frames})
     return len(frames), unused
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import StrPath, locked, replacing, write_file
+from og_pointcloud.formats.atomic import StrPath, locked, replacing, write_json
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MADE_NAME, MASKS_FOLDER, TRACKS
@@ -224,7 +224,7 @@ def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]
     """Write made.json. record: what a run adds at its end."""
     named = {key: _last_part(value) for key, value in asdict(settings).items()}
     made = {"made_by": "og-pointcloud masks", **named, "images": len(tasks), **record}
-    _write_json(target / MASKS_FOLDER / MADE_NAME, made)
+    write_json(target / MASKS_FOLDER / MADE_NAME, made)
 
 
 def _last_part(value: Any) -> Any:
@@ -245,10 +245,6 @@ def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) 
             content = read_json_object(source)
             frames = content["frames"]
             content["frames"] = [frame for frame in frames if frame["file_path"].replace("\\", "/") in kept]
-            _write_json(place, content)
+            write_json(place, content)
         elif not place.exists():
             place.symlink_to(source)
-
-
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    write_file(path, json.dumps(value, indent=1).encode() + b"\n")

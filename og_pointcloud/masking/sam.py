@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.masking.automatic import AutomaticMasks
 from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_config, torch
 from og_pointcloud.models import fetched_model
 
@@ -46,11 +45,6 @@ class Preparation:
     padded: bool
     mean: tuple[float, ...]
     std: tuple[float, ...]
-
-
-def open_sam(name: StrPath) -> AutomaticMasks:
-    """A proposer from a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
-    return AutomaticMasks(SamPredictor(name))
 
 
 @dataclass(frozen=True)
@@ -89,6 +83,7 @@ class SamPredictor:
     """A `PointPredictor` on SAM, SAM-HQ, SAM 2 or SAM 3."""
 
     def __init__(self, name: StrPath) -> None:
+        """name: a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
         self.loaded = load_sam(name, CLASSES)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}

@@ -31,7 +31,7 @@ class NamedThings:
     """A proposer of what words name in an image by itself."""
 
     def __init__(self, name: StrPath, words: Sequence[str]) -> None:
-        """name: as for `sam.open_sam`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
+        """name: as for `sam.SamPredictor`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
         self._loaded = load_sam(name, {"sam3": "Sam3Model", "sam3_video": "Sam3Model"})
         self._tokens = _tokens(self._loaded, words)
 

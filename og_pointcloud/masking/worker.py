@@ -103,9 +103,10 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
 
         return OpenCVProposer()
     if kind == "sam" and name:
-        from og_pointcloud.masking.sam import open_sam
+        from og_pointcloud.masking.automatic import AutomaticMasks
+        from og_pointcloud.masking.sam import SamPredictor
 
-        return open_sam(name)
+        return AutomaticMasks(SamPredictor(name))
     if kind == "python" and name:
         return own_proposer(name)
     raise SceneError(

@@ -20,6 +20,7 @@ import viser
 from numpy.typing import NDArray
 from viser.transforms import SO3
 
+from og_pointcloud.ask.boxes import unit_up
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.show.live import Answer, LiveScene
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
@@ -62,6 +63,7 @@ def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None
     if empty or not scenes:
         raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no point to show; expected at least one")
     settings = settings or ServeSettings()
+    unit_up(settings.up)  # which refuses what is no direction
     _check_address(settings.host, settings.port)
     return LivePage(scenes, settings)
 
@@ -208,8 +210,7 @@ class LivePage:
         live = self._live
         low, high = live.xyz.min(axis=0), live.xyz.max(axis=0)
         self._middle = low + (high - low) / 2  # the page's origin: browsers draw in float32
-        up = np.array(self._settings.up, np.float64)
-        view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, up / np.linalg.norm(up))
+        view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, unit_up(self._settings.up))
         camera = self._server.initial_camera
         camera.fov, camera.up = 2 * float(np.arctan(1 / FOCAL)), view.up
         camera.position, camera.look_at = view.eye - self._middle, view.target - self._middle

@@ -14,6 +14,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
+from og_pointcloud.ask.boxes import unit_up
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, find_scene
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.errors import OgPointcloudError
@@ -123,10 +124,10 @@ class OgPlotter:
 
         up: (3,) direction that is up in the picture.
         """
-        mesh = _drawable(mesh)
-        axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+        mesh, direction = _drawable(mesh), unit_up(up)
+        label_names(mesh)  # which says so where it has no labels
         points = np.asarray(mesh.points, np.float64)
-        self.look(choose_viewpoint(points, np.asarray(mesh.point_data[LABEL]) >= 0, axis))
+        self.look(choose_viewpoint(points, np.asarray(mesh.point_data[LABEL]) >= 0, direction))
 
     def look(self, view: Viewpoint) -> None:
         """Put the camera where a `Viewpoint` says."""
