@@ -5,7 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from labelled_clouds import room
 from scenes import TinyCapture, write_tiny_capture
+
+import og_pointcloud as og
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`labelled_clouds.room` as a file, which no test changes."""
+    return og.write_bundle(room(), tmp_path_factory.mktemp("scène") / "room.ogpc")
+
+
+@pytest.fixture(scope="session")
+def scene(bundle: Path) -> og.LabelledScene:
+    """The same, opened."""
+    return og.load(bundle)
 
 
 @pytest.fixture

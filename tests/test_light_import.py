@@ -8,8 +8,6 @@ import subprocess
 import sys
 
 import pytest
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 
 HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "trimesh", "laspy", "tqdm")
 ASK = """
@@ -36,11 +34,6 @@ assert hit.instance == 5 and hit.mask(camera).any() and len(hit.words()) == 5
 """
 
 
-@pytest.fixture(scope="module")
-def bundle_file(tmp_path_factory):
-    return write_bundle(room(500), tmp_path_factory.mktemp("bundle") / "room.ogpc")
-
-
 def run(code, *arguments, **environment):
     command = [sys.executable, "-c", code, *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, timeout=60)
@@ -54,20 +47,20 @@ def test_import_brings_nothing_heavy():
     assert not {*HEAVY, "numpy", "onnxruntime"} & set(loaded)
 
 
-def test_loading_and_asking_bring_nothing_heavy(bundle_file, tmp_path):
-    loaded = run(ASK + "print(*sys.modules)", bundle_file, tmp_path).split()
+def test_loading_and_asking_bring_nothing_heavy(bundle, tmp_path):
+    loaded = run(ASK + "print(*sys.modules)", bundle, tmp_path).split()
     assert "onnxruntime" in loaded
     assert not set(HEAVY) & set(loaded)
 
 
-def test_a_cloud_in_memory_is_asked_without_its_exporter(bundle_file, tmp_path):
+def test_a_cloud_in_memory_is_asked_without_its_exporter(bundle, tmp_path):
     """Nothing heavy, and nothing of what writes files: its arrays answer."""
     blocked = f"import sys; sys.modules.update(dict.fromkeys({(*HEAVY, 'og_pointcloud_export')}))\n"
     in_memory = ASK.replace("og.load(sys.argv[1])", "og.LabelledScene.from_cloud(og.load(sys.argv[1]).cloud)")
-    run(blocked + in_memory, bundle_file, tmp_path)
+    run(blocked + in_memory, bundle, tmp_path)
 
 
-def test_a_missing_extra_is_named(bundle_file, tmp_path):
+def test_a_missing_extra_is_named(bundle, tmp_path):
     blocked = """import sys
 sys.modules.update(dict.fromkeys(["numba", "open3d", "pyvista", "laspy"]))
 import og_pointcloud as og
@@ -89,7 +82,7 @@ for ask in (
 """
     modules = ("numba", "open3d", "pyvista", "laspy", "laspy")
     extras = ("fit", "open3d", "pyvista", "las", "las")
-    assert run(blocked + tried, bundle_file, tmp_path).splitlines() == [
+    assert run(blocked + tried, bundle, tmp_path).splitlines() == [
         f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'"
         for module, extra in zip(modules, extras, strict=True)
     ]
@@ -110,8 +103,8 @@ except og.MissingExtraError as error:
 
 
 @pytest.mark.parametrize("command", ["fit CAPTURE -o x.ogpc", "compare SCENE SCENE", "report CAPTURE -o report"])
-def test_commands_that_make_scenes_name_their_extra(command, bundle_file, tmp_path):
-    words = command.replace("SCENE", str(bundle_file)).replace("CAPTURE", str(tmp_path)).split()
+def test_commands_that_make_scenes_name_their_extra(command, bundle, tmp_path):
+    words = command.replace("SCENE", str(bundle)).replace("CAPTURE", str(tmp_path)).split()
     code = f"import sys; sys.modules['scipy'] = None\nfrom og_pointcloud.cli import main\nsys.exit(main({words}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert done.returncode == 2
@@ -119,13 +112,13 @@ def test_commands_that_make_scenes_name_their_extra(command, bundle_file, tmp_pa
     assert "report it" not in done.stderr
 
 
-def test_asking_writes_nothing_into_the_home_folder(bundle_file, tmp_path):
+def test_asking_writes_nothing_into_the_home_folder(bundle, tmp_path):
     home, out = tmp_path / "home", tmp_path / "out"
     home.mkdir()
     out.mkdir()
     quiet = {"CI", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME"}
     environment = {name: value for name, value in os.environ.items() if name not in quiet}
-    command = [sys.executable, "-B", "-c", ASK, str(bundle_file), str(out)]
+    command = [sys.executable, "-B", "-c", ASK, str(bundle), str(out)]
     subprocess.run(command, check=True, env=environment | {"HOME": str(home)}, timeout=60)
     assert list(home.rglob("*")) == []
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labelled_clouds import make_cloud, room
+from labelled_clouds import make_cloud
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
@@ -25,16 +25,6 @@ from og_pointcloud_open3d import convert  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 WORDS = ["apple", "pear", "plum"]
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return write_bundle(room(1200), tmp_path_factory.mktemp("scene") / "room.ogpc")
-
-
-@pytest.fixture(scope="module")
-def scene(bundle):
-    return og.load(bundle)
 
 
 def legacy_cloud(scene):

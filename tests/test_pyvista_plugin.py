@@ -24,19 +24,9 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return write_bundle(room(), tmp_path_factory.mktemp("scène") / "room.ogpc")
-
-
-@pytest.fixture(scope="module")
 def drawing():
     if not can_render():
         pytest.skip("VTK cannot draw off-screen here")
-
-
-@pytest.fixture
-def scene(bundle):
-    return og.load(bundle)
 
 
 @pytest.fixture

@@ -37,16 +37,6 @@ from og_pointcloud.formats.colors import label_colors
 CLOUDS = tough_clouds()
 
 
-@pytest.fixture(scope="module")
-def bundle_file(tmp_path_factory):
-    return write_bundle(room(), tmp_path_factory.mktemp("bundle") / "room.ogpc")
-
-
-@pytest.fixture(scope="module")
-def scene(bundle_file):
-    return og.load(bundle_file)
-
-
 def labels_plainly(cloud, instances, words):
     """Label and score of each instance id by float64 cosines."""
     scores = reference_scores(cloud.instances, words)
@@ -120,32 +110,32 @@ def test_answers_are_told_apart_and_kept_in_sets(scene):
         assert [other, one].index(one) == 1
 
 
-def test_a_scene_offers_its_parts(scene, bundle_file):
+def test_a_scene_offers_its_parts(scene, bundle):
     cloud = room()
     assert scene.xyz.dtype == np.float64
     assert (scene.xyz == cloud.xyz_world).all()
     assert scene.instance_ids.dtype == np.int32
     assert (scene.instance_ids == cloud.instance_ids).all()
     assert len(scene.instances) == 9
-    assert (scene.feature_space, scene.vocabulary.names, scene.path) == (SPACE, WORDS, bundle_file)
+    assert (scene.feature_space, scene.vocabulary.names, scene.path) == (SPACE, WORDS, bundle)
     assert scene.manifest["counts"]["points"] == len(scene.xyz)
 
 
 # Which scene is asked
 
 
-def test_the_scene_may_be_named_in_any_way_but_must_be(scene, bundle_file):
+def test_the_scene_may_be_named_in_any_way_but_must_be(scene, bundle):
     points = scene.xyz[:50]
     expected = og.segment(points, ["apple", "pear"], scene).labels
-    for given in (bundle_file, str(bundle_file), room()):
+    for given in (bundle, str(bundle), room()):
         assert (og.segment(points, ["apple", "pear"], given).labels == expected).all()
     with pytest.raises(OgPointcloudError, match=r"no scene to ask: pass scene=og.load"):
         og.segment(points, ["apple", "pear"])
 
 
 @pytest.mark.parametrize("kind", ["scene", "cloud", "path", "text path"])
-def test_a_scene_may_be_the_cloud(scene, bundle_file, kind):
-    pcd = {"scene": scene, "cloud": room(), "path": bundle_file, "text path": str(bundle_file)}[kind]
+def test_a_scene_may_be_the_cloud(scene, bundle, kind):
+    pcd = {"scene": scene, "cloud": room(), "path": bundle, "text path": str(bundle)}[kind]
     result = og.segment(pcd, ["apple", "pear"])
     assert (result.instances == scene.instance_ids).all()
     assert (result.xyz == scene.xyz).all()
@@ -603,9 +593,9 @@ def test_points_that_the_table_leaves_open_are_settled_exactly(monkeypatch, tmp_
     assert still_open.sum() > 20
 
 
-def test_scenes_and_answers_go_to_other_processes(scene, bundle_file):
+def test_scenes_and_answers_go_to_other_processes(scene, bundle):
     points = queries(scene.cloud, 200).astype(np.float64)
-    ask = og.Segmenter(og.load(bundle_file), ["apple", "pear"])
+    ask = og.Segmenter(og.load(bundle), ["apple", "pear"])
     answer = ask(points)
     sent = pickle.loads(pickle.dumps((ask, answer, og.select(ask.scene, "apple"))))
     assert same(sent[1], answer)

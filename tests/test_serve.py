@@ -130,6 +130,10 @@ def test_bad_use_is_refused_in_one_line(viser, bundle, capsys, monkeypatch, opti
 def test_an_empty_scene_is_refused(viser, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
     assert "empty has no point to show" in error_of(capsys, "serve", empty)
+    from og_pointcloud.show.serve import ServeSettings, serve
+
+    with pytest.raises(og.SceneError, match=r"up is \(0, 0, 0\); expected a direction"):
+        serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, ServeSettings(up=(0, 0, 0)))
 
 
 def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):

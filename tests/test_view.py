@@ -23,11 +23,6 @@ from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 Z_UP = np.array([0.0, 0, 1])
 
 
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return write_bundle(room(), tmp_path_factory.mktemp("room") / "room.ogpc")
-
-
 def content(page):
     """What is shown: the JSON in a page, with its arrays unpacked."""
     text = page.read_text(encoding="utf-8")
