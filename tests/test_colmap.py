@@ -23,7 +23,6 @@ def test_binary_and_text_hold_the_same_world(tmp_path, write, offset):
     world = make_world(offset=(offset, -offset, 10.0))
     write(tmp_path / "sparse/0", world)
     model = find_model(tmp_path)
-    assert model is not None
     assert model == tmp_path / "sparse/0"
     images = read_images(model)
     assert [image.path for image in images] == [f"{name}.png" for name in world.names]

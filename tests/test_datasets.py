@@ -103,7 +103,6 @@ def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
         np.testing.assert_allclose(view.camera.world_to_camera[:3, :3].T, pose[:3, :3], atol=1e-5)
         assert (view.camera.width, view.camera.height) == size
         image = view.image_rgb()
-        assert image is not None
         assert image.shape == (size[1], size[0], 3)
 
 

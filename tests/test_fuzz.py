@@ -197,7 +197,6 @@ def _read_in_layout(place: str, images: dict[str, bytes]) -> Callable[[Path], li
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
         frames = read_rgbd(folder)
-        assert frames is not None
         return [image.camera.world_to_camera for image in frames.images]
 
     return read

@@ -628,7 +628,6 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     og.write_bundle(room(), tmp_path / "scans" / "a.ogpc")
     os.mkfifo(tmp_path / "scans" / "b.ogpc")
     changes = og.Collection.index(tmp_path / "scans", tmp_path / "atlas", progress=False).changes
-    assert changes is not None
     assert changes.added == ("a",)
     assert [name for name, _ in changes.left_out] == ["b"]
 

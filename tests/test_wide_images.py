@@ -107,7 +107,6 @@ def test_a_mask_across_a_border_of_faces_is_one_mask_of_each(panoramas):
 def test_photographs_are_split_like_their_masks(panoramas):
     for view in read_capture(panoramas).views[:6]:
         image, ids = view.image_rgb(), view.mask_map()
-        assert image is not None
         inside = np.abs(cv2.blur(ids.astype(np.float32), (5, 5)) - ids) < 1e-6
         owner = np.append(view.mask_features.argmax(1), -1)
         numbers = owner[ids] + 1
@@ -153,7 +152,6 @@ def test_masks_of_half_the_size_halve_the_views(panoramas):
     assert {view.camera.width for view in scene.views} == {40}
     assert all(view.mask_map().shape == (40, 40) for view in scene.views)
     image = scene.views[0].image_rgb()
-    assert image is not None
     assert image.shape == (40, 40, 3)
 
 
