@@ -17,6 +17,13 @@ def run(capsys: Any, *arguments: object) -> tuple[int | str | None, str, str]:
     return code, printed.out, printed.err
 
 
+def output_of(capsys: Any, *arguments: object) -> str:
+    """What a command that must succeed writes to stdout."""
+    code, stdout, stderr = run(capsys, *arguments)
+    assert code == 0, stderr
+    return stdout
+
+
 def error_of(capsys: Any, *arguments: object) -> str:
     """The one line that a command which must fail writes."""
     code, _, stderr = run(capsys, *arguments)

@@ -9,7 +9,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from commands import error_of, run
+from commands import error_of, output_of, run
 from scenes import (
     COLOURS,
     NAMES,
@@ -43,8 +43,7 @@ def fitted(tmp_path_factory):
 def test_fitted_points_get_their_names(fitted, tmp_path, capsys):
     capture, bundle = fitted
     output = tmp_path / "labels.npz"
-    code, stdout, _ = run(capsys, "segment", bundle, "--labels", ",".join(NAMES), "-o", output)
-    assert code == 0
+    stdout = output_of(capsys, "segment", bundle, "--labels", ",".join(NAMES), "-o", output)
     assert all(name in stdout for name in NAMES)
     result = np.load(output)
     assert result["labels"].dtype == np.int32
@@ -58,8 +57,7 @@ def test_fitted_points_get_their_names(fitted, tmp_path, capsys):
 def test_without_labels_all_names_of_the_file_are_asked(fitted, tmp_path, capsys):
     capture, bundle = fitted
     output = tmp_path / "labels.npz"
-    code, _, _ = run(capsys, "segment", bundle, "--text-features", capture.text_features, "-o", output)
-    assert code == 0
+    output_of(capsys, "segment", bundle, "--text-features", capture.text_features, "-o", output)
     assert list(np.load(output)["names"]) == [*NAMES, UNUSED_NAME]
 
 
@@ -81,8 +79,7 @@ def test_points_in_a_frame_of_their_own_are_placed_by_a_pose(fitted, tmp_path, c
     write_ply(tmp_path / "scan.ply", (xyz - pose[:3, 3]) @ pose[:3, :3], COLOURS[object_ids])
     np.savetxt(tmp_path / "pose.txt", pose)
     asked = "segment", bundle, "--points", tmp_path / "scan.ply", "--pose", tmp_path / "pose.txt"
-    code, stdout, _ = run(capsys, *asked, "-o", tmp_path / "placed.ply")
-    assert code == 0
+    stdout = output_of(capsys, *asked, "-o", tmp_path / "placed.ply")
     assert "scan.ply" not in stdout.splitlines()[-1], "view would show the scan where it is not"
     np.testing.assert_allclose(og.read_points(tmp_path / "placed.ply").xyz_world, xyz, atol=1e-5)
     for name, command in (("placed", asked), ("whole", asked[:2])):
@@ -103,8 +100,7 @@ def test_segment_json_counts_every_point(fitted, capsys):
 
 def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys):
     bundle, record = tmp_path / "tiny.ogpc", tmp_path / "run.json"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record)
-    assert code == 0
+    stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record)
     report = json.loads(record.read_text())
     assert report["points"] == len(tiny_capture.object_ids)
     assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
@@ -118,8 +114,7 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
 
 def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsys):
     (tiny_capture.folder / "text_features.npz").unlink()
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
-    assert code == 0
+    stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
     assert "no words are known yet" in stdout
     command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
@@ -149,8 +144,7 @@ def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys):
         ("instances", bundle, "-o", tmp_path / "a.csv"),
         ("find", tmp_path / "atlas", "red ball", "--html", tmp_path / "found.html"),
     ):
-        code, stdout, _ = run(capsys, *command)
-        assert code == 0
+        stdout = output_of(capsys, *command)
         *_, last = stdout.splitlines()
         assert last.startswith("next: "), command
         assert run(capsys, *shlex.split(last[last.index("og-pointcloud ") :])[1:])[0] == 0, last
@@ -265,8 +259,7 @@ def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     """The capture's own is left out and said so; one that was asked for is an error."""
     rewrite_npz(tiny_capture.text_features, feature_space=np.array("another space"))
     bundle = tmp_path / "s.ogpc"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle)
-    assert code == 0
+    stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", bundle)
     assert {0, 1} <= set(load(bundle).instance_ids), "without words there are instances"
     assert "left out: vocabulary" in stdout
     assert "another space" in stdout
@@ -328,8 +321,7 @@ def test_a_pixel_selects_the_ball_it_shows(fitted, tmp_path, capsys):
 
 def test_a_place_selects_the_ball_it_is_on(fitted, capsys):
     _, bundle = fitted
-    code, stdout, _ = run(capsys, "pick", bundle, "--xyz", "-0.6,0,1.0")
-    assert code == 0
+    stdout = output_of(capsys, "pick", bundle, "--xyz", "-0.6,0,1.0")
     assert stdout.startswith("instance ")
     assert "best words: red ball 1.00" in stdout
     assert run(capsys, "pick", bundle, "--xyz", "9,9,9")[1] == "no point of the scene\n"
@@ -354,8 +346,7 @@ def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     np.savez(words, names=np.array(["cup", "lid"]), vectors=vectors, feature_space=np.array("their space"))
     bundle = tmp_path / "new" / "run.ogpc"
     arguments = ("import", tmp_path / "run", "-o", bundle, "--feature-space", "their space", "--text-features", words)
-    code, stdout, _ = run(capsys, *arguments)
-    assert code == 0
+    stdout = output_of(capsys, *arguments)
     assert "iteration_90000" in stdout
     assert "in 4 instances" in stdout
     assert "2 of 4 instances have no feature" in stdout

@@ -13,7 +13,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from commands import error_of
+from commands import error_of, output_of
 from labelled_clouds import instance_table, unit_rows
 
 import og_pointcloud as og
@@ -392,17 +392,14 @@ def test_commands(folder, capsys, tmp_path):
     assert "2 added" in out
     assert "2 scenes with 3 instances" in out
     assert "broken is left out" in err
-    assert main(["find", atlas, "mug", "--json", "--html", str(page)]) == 0
-    records = json.loads(capsys.readouterr().out)
+    records = json.loads(output_of(capsys, "find", atlas, "mug", "--json", "--html", page))
     assert list(records[0]) == ["scene", "instance", "word", "score", "center", "size"]
     assert (records[0]["scene"], records[0]["instance"], records[0]["word"]) == ("room0", 1, "mug")
     assert len(records) == 3
     text = page.read_text()
     assert text.count("data:image/png;base64,") == 3
-    assert main(["find", atlas, "mug", "--scene", "room1", "--top", "1"]) == 0
-    assert "room1" in capsys.readouterr().out
-    assert main(["find", atlas, "mug", "--within", "5,5,5,6,6,6"]) == 0
-    assert "nothing was found" in capsys.readouterr().out
+    assert "room1" in output_of(capsys, "find", atlas, "mug", "--scene", "room1", "--top", "1")
+    assert "nothing was found" in output_of(capsys, "find", atlas, "mug", "--within", "5,5,5,6,6,6")
     for scenes, says in (("room0", False), ("room1", True)):  # the latter has a desk alone
         assert main(["find", atlas, "mug", "--scene", scenes]) == 0
         assert ("nothing fits what was asked" in capsys.readouterr().out) is says

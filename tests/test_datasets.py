@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import edit_poses, write_masks
-from commands import error_of
+from commands import error_of, output_of
 from scenes import ROOM_SIZE, distance_to_surface, look, room_poses, write_depth, write_rgb
 
-from og_pointcloud.cli import main
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
 from og_pointcloud.formats.depth import resampled
@@ -264,8 +263,7 @@ def test_damaged_data_sets_name_the_file_and_the_cure(tmp_path, write, file, con
 def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):
     names = nerfstudio(tmp_path)
     add_masks(tmp_path, names, SIZE)
-    assert main(["fuse", str(tmp_path)]) == 0
-    assert "6 depth images" in capsys.readouterr().out
+    assert "6 depth images" in output_of(capsys, "fuse", tmp_path)
     cloud = read_points(tmp_path / "points.ply")
     assert distance_to_surface(cloud.xyz_world).max() < 0.03
     assert cloud.rgb is not None

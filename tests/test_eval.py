@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import error_of
+from commands import error_of, output_of
 from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 from scenes import NAMES, write_tiny_capture
 
@@ -41,8 +41,7 @@ def fitted(tmp_path_factory) -> Path:
 def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
     command = ["eval", "capture", str(fitted / "tiny"), str(fitted / "S.ogpc")]
     outputs = ["--json", str(tmp_path / "s.json")]
-    assert main([*command, "--against", str(fitted / "worse.ogpc"), *outputs]) == 0
-    out = capsys.readouterr().out
+    out = output_of(capsys, *command, "--against", fitted / "worse.ogpc", *outputs)
     entry = json.loads((tmp_path / "s.json").read_text())["tiny"]
     words = fitted / "tiny/text_features.npz"
     result = og.segment(og.load(fitted / "S.ogpc"), None, text_features=words)

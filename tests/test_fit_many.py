@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import error_of
+from commands import error_of, output_of
 from scenes import write_tiny_capture
 
 import og_pointcloud as og
@@ -243,8 +243,7 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     assert "1 of 2 captures failed" in said.err
     assert [fit["state"] for fit in json.loads(report.read_text())["fits"]] == ["fitted", "failed"]
     assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}
-    assert main(["fit", str(captures[0]), "--out", str(out)]) == 0
-    assert "1 were there already" in capsys.readouterr().out
+    assert "1 were there already" in output_of(capsys, "fit", captures[0], "--out", out)
     assert "expected --out DIR" in error_of(capsys, "fit", captures[0], captures[1], "-o", tmp_path / "x.ogpc")
     assert "--work is for a single file" in error_of(capsys, "fit", captures[0], "--out", out, "--work", tmp_path / "w")
 

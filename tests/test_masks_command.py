@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import BY_COLOR, HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
-from commands import error_of
+from commands import error_of, output_of
 from PIL import Image
 from scenes import write_image, write_ply
 
@@ -191,8 +191,7 @@ def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
     assert "was not made by this command" in error_of(capsys, "masks", tmp_path / "c", *QUICKLY)
     assert theirs.read_bytes() == b"mine"
     assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--overwrite"]) == 0
-    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--level", "small"]) == 0
-    out = capsys.readouterr().out
+    out = output_of(capsys, "masks", tmp_path / "c", *QUICKLY, "--level", "small")
     assert "next: og-pointcloud fit" in out
 
 
@@ -266,8 +265,7 @@ def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     poses.write_bytes(b"\xef\xbb\xbf" + poses.read_bytes())  # the mark that editors of Windows put before it
     assert "(-o DIR)" in error_of(capsys, "masks", tmp_path / "c", *QUICKLY, "--every", "2")
     output = tmp_path / "c" / "half"
-    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2", "-o", str(output)]) == 0
-    said = capsys.readouterr().out
+    said = output_of(capsys, "masks", tmp_path / "c", *QUICKLY, "--every", "2", "-o", output)
     assert f"left out: 2 of 5 images: {world.names[1]}, {world.names[3]}" in said
     scene = read_capture(output)
     assert [view.name for view in scene.views] == world.names[::2]

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import error_of
+from commands import error_of, output_of
 from labelled_clouds import WIDTH, WORDS, make_cloud, room, unit_rows
 
 import og_pointcloud as og
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 
@@ -124,11 +123,9 @@ def test_no_instance_at_all():
 
 def test_command(tmp_path, capsys):
     bundle = og.write_bundle(mugs_and_a_cup().cloud, tmp_path / "mugs.ogpc")
-    assert main(["select", str(bundle), "mug"]) == 0
-    out = capsys.readouterr().out
+    out = output_of(capsys, "select", bundle, "mug")
     assert out.startswith("'mug' fits 2 of 3 instances\n* instance 0")
     assert "1 instances have no feature" in out
-    assert main(["select", str(bundle), "mug", "--against", "", "--json"]) == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(output_of(capsys, "select", bundle, "mug", "--against", "", "--json"))
     assert [match["instance"] for match in record["matches"] if match["fits"]] == [0]
     assert "zebra" in error_of(capsys, "select", bundle, "zebra")
