@@ -219,7 +219,9 @@ def test_degenerate_points_have_a_box_with_lengths_of_zero(name, offset):
     assert without_strays(xyz).all()
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), [[0, np.nan, 0]], [[0, np.inf, 0]]])
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 3)), np.zeros((4, 2)), [[0, np.nan, 0]], [[0, np.inf, 0]], [[1e200, 0, 0]]]
+)
 def test_points_without_a_box_are_refused(points):
     for make in (axis_aligned_box, oriented_box, partial(main_part, spacing=1.0)):
         with pytest.raises(SceneError, match="expected"):

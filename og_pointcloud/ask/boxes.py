@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.poses import quaternion_of, upright_axes
+from og_pointcloud.formats.poses import LARGEST, quaternion_of, upright_axes
 from og_pointcloud.scene import DoubleArray
 
 DIRECTIONS = 180
@@ -198,8 +198,10 @@ def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
 
 def _checked(points: ArrayLike) -> DoubleArray:
     xyz = _rows(points, fewest=1)
-    if not np.isfinite(xyz).all():
-        raise SceneError("points hold NaN or infinity; expected finite coordinates: leave those points out")
+    if not (np.abs(xyz) <= LARGEST).all():  # NaN is not
+        raise SceneError(
+            f"points hold NaN, infinity or more than {LARGEST:g}; expected finite coordinates: leave those points out"
+        )
     return xyz
 
 

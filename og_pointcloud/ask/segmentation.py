@@ -147,16 +147,25 @@ class Segmentation:
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
         room for NaN, .glb none for an empty cloud.
         """
-        path = Path(path)
+        path, columns = Path(path), (self.xyz, self.colors, self.attributes, self.names)
         if path.suffix not in SAVED_AS:
             raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")
         if path.suffix == ".npz":
             self._save_arrays(path)
         elif path.suffix == ".spz":
             self._save_spz(path, splats)
+        elif path.suffix == ".glb":
+            from og_pointcloud.formats.gltf import write_gltf
+
+            write_gltf(path, *columns, splats)
+        elif path.suffix == ".ply":
+            from og_pointcloud.formats.points import write_labelled_ply
+
+            write_labelled_ply(path, *columns)
         else:
-            more = {".glb": {"splats": splats}, ".las": {"source": source}, ".laz": {"source": source}}
-            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names, **more.get(path.suffix, {}))
+            from og_pointcloud.formats.las import write_las
+
+            write_las(path, *columns, source)
         return path
 
     def _save_spz(self, path: Path, splats: Points | None) -> None:
@@ -179,14 +188,3 @@ class Segmentation:
             arrays["certainty"] = self.certainty
         with replacing(path) as file:
             np.savez(file, **arrays)
-
-
-def _writer(ending: str) -> Callable[..., None]:
-    """The function that writes a labelled cloud to a file of that ending."""
-    if ending == ".ply":
-        from og_pointcloud.formats.points import write_labelled_ply as write
-    elif ending in (".las", ".laz"):
-        from og_pointcloud.formats.las import write_las as write
-    else:
-        from og_pointcloud.formats.gltf import write_gltf as write
-    return write

@@ -10,7 +10,7 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -152,13 +152,13 @@ def carried_encoder(path: StrPath | None) -> CarriedEncoder:
     It returns None where the file carries no encoder or is no longer there, and the same encoder again for an unchanged
     file. OgPointcloudError where the encoder cannot be used.
     """
-    return partial(_carried, path)
 
+    def opened() -> TextEncoder | None:
+        if path is None or not Path(path).is_file():
+            return None
+        return _carried_once(Path(path).resolve(), Path(path).stat().st_mtime_ns)
 
-def _carried(path: StrPath | None) -> TextEncoder | None:
-    if path is None or not Path(path).is_file():
-        return None
-    return _carried_once(Path(path).resolve(), Path(path).stat().st_mtime_ns)
+    return opened
 
 
 @lru_cache(maxsize=2)

@@ -84,7 +84,7 @@ def make_masks(
     _refuse_foreign(target, overwrite)
     # Names of work files hold all that decides what is in them, so that what exists can be used as it is.
     work = target / WORK_FOLDER / _fingerprint(settings)
-    tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
+    tasks = [ImageTask(each, work / f"{_digest([each.name, *_state(each.file)])}.npz") for each in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
     made, done_before = None if overwrite else _made_before(target, tasks, key), len(tasks)
     if made is None:
@@ -125,10 +125,6 @@ def _fingerprint(settings: MaskSettings) -> str:
     kind, _, place = settings.proposer.partition(":")
     given = sorted(settings.folder.rglob("*")) if settings.folder else [own_file(place)] if kind == "python" else []
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
-
-
-def _work_name(photograph: Photograph) -> str:
-    return f"{_digest([photograph.name, *_state(photograph.file)])}.npz"
 
 
 def _state(file: Path) -> tuple[str, int, int]:

@@ -50,7 +50,7 @@ def resolve_labels(
     if isinstance(labels, Vocabulary):
         return _checked(labels.names, labels.vectors) if labels.names else labels
     if isinstance(labels, Mapping):
-        return _checked([str(name) for name in labels], _stacked(labels))
+        return _checked([str(name) for name in labels], _stacked(labels, labels.values()))
     words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
     for word in words:
         if not isinstance(word, str):
@@ -85,9 +85,9 @@ def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | N
     return vocabulary
 
 
-def _stacked(labels: Mapping[str, Any]) -> NDArray[Any]:
+def _stacked(names: Iterable[str], vectors: Iterable[Any]) -> NDArray[Any]:
     rows = []
-    for name, vector in labels.items():
+    for name, vector in zip(names, vectors, strict=True):
         row = np.asarray(vector)
         if row.ndim != 1 or row.dtype.kind not in "fiu" or row.shape != (rows[0] if rows else row).shape:
             raise FeatureSpaceError(
@@ -114,14 +114,4 @@ def _looked_up(
         raise OgPointcloudError(
             f"'{first}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
         )
-    _check_one_width(words, vectors)
-    return np.array([vectors[word] for word in words], np.float32)
-
-
-def _check_one_width(words: tuple[str, ...], vectors: Mapping[str, np.ndarray]) -> None:
-    widths = {len(vectors[word]): word for word in words}
-    if len(widths) > 1:
-        (one, first), (other, second), *_ = widths.items()
-        raise FeatureSpaceError(
-            f"'{first}' has a vector of width {one}, '{second}' of {other}: they come from two encoders under one name"
-        )
+    return _stacked(words, (vectors[word] for word in words)).astype(np.float32)
