@@ -110,8 +110,8 @@ def test_reading_refuses_what_open3d_reads_as_nothing(scene, tmp_path):
         (tmp_path / name).write_text("no numbers here\n")
         with pytest.raises(SceneError, match="Open3D reads no point of it"):
             og3.read(tmp_path / name)
-    open3d.io.write_point_cloud(str(tmp_path / "d.pcd"), legacy_cloud(scene))
-    for damaged in (path, tmp_path / "d.pcd"):
+    open3d.io.write_point_cloud(str(tmp_path / "D.PCD"), legacy_cloud(scene))
+    for damaged in (path, tmp_path / "D.PCD"):
         damaged.write_bytes(damaged.read_bytes()[:-50])
         with pytest.raises(SceneError, match=f"{damaged.name}: .*truncated"):  # Open3D returns uninitialised memory
             og3.read(damaged)

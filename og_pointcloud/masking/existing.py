@@ -129,10 +129,10 @@ class ExistingMasks:
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
         # Views are called by their stems, or by paths below a folder that COCO's paths may begin with.
-        alike = [key for key in self._coco if key.rsplit("/", 1)[-1] == image_name.rsplit("/", 1)[-1]]
-        named = [key for key in alike if f"/{key}".endswith(f"/{image_name}")] or alike
+        alike = self._coco.get(image_name.rsplit("/", 1)[-1], {})
+        named = [path for path in alike if f"/{path}".endswith(f"/{image_name}")] or [*alike]
         if len(named) == 1:
-            return _resized(_from_annotations(self._coco[named[0]], f"{self.folder}, image '{named[0]}'"), shape)
+            return _resized(_from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'"), shape)
         if named:
             raise SceneError(
                 f"{self.folder} lists {len(named)} images that '{image_name}' could be ({', '.join(named):.120}); "
@@ -144,27 +144,28 @@ class ExistingMasks:
         )
 
     @cached_property
-    def _coco(self) -> dict[str, list[dict[str, Any]]]:
-        """Annotations by image path without suffix, each with the image's size, from all COCO files of the folder."""
-        found: dict[str, list[dict[str, Any]]] = {}
+    def _coco(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
+        """Annotations by the stem of their image, and its path without suffix, each with the image's size, from all
+        COCO files of the folder."""
+        found: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for file in sorted(self.folder.glob("*.json")):
             content = read_json(file, MAX_JSON_BYTES)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
             # COCO lists images and annotations apart; polygons need the size of their image.
-            images: dict[Any, tuple[str, list[Any]]] = {}
+            images: dict[Any, tuple[list[dict[str, Any]], list[Any]]] = {}
             for image in content["images"]:
                 known = isinstance(image, dict) and isinstance(image.get("id"), (int, str, type(None)))
                 if not known or not isinstance(image.get("file_name"), str):
                     raise SceneError(f"{file}: an image is {image!r:.60}; expected id, file_name, height and width")
                 path = without_suffix(image["file_name"].replace("\\", "/"))
-                images[image.get("id")] = path, [image.get("height"), image.get("width")]
-                found.setdefault(path, [])
+                of_image = found.setdefault(path.rsplit("/", 1)[-1], {}).setdefault(path, [])
+                images[image.get("id")] = of_image, [image.get("height"), image.get("width")]
             for annotation in _annotations(content.get("annotations")):
                 image_id = annotation.get("image_id")
                 if isinstance(image_id, (int, str)) and image_id in images:
-                    path, size = images[image_id]
-                    found[path].append({**annotation, "size": size})
+                    of_image, size = images[image_id]
+                    of_image.append({**annotation, "size": size})
         return found
 
 

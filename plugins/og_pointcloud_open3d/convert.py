@@ -38,7 +38,7 @@ def read(path: StrPath) -> Any:
     host, path = open3d(), Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a point cloud")
-    if path.suffix in (".ply", ".pcd"):
+    if path.suffix.lower() in (".ply", ".pcd"):
         world_points(path)  # which raises for the damaged ones
     with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below says it
         cloud = host.t.io.read_point_cloud(str(path))
