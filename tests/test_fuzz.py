@@ -144,35 +144,21 @@ def _metashape(folder: Path) -> list[bytes]:
     return ["".join(parts).encode(), "".join(parts).replace('"frame"', '"fisheye"').encode()]
 
 
-def _realityscan(folder: Path) -> list[bytes]:
-    header = b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
-    return [header + b"a.jpg,1,2,3,10,20,30,35,0.1,0.2,0.1,0,0,0,0.01,0\n"]
-
-
 def _polycam(folder: Path) -> list[bytes]:
     keys = {"fx": 70.0, "fy": 70.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}
     keys |= {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
     return [json.dumps(keys).encode()]
 
 
-def _scanner_app(folder: Path) -> list[bytes]:
-    content = {"cameraPoseARFrame": np.eye(4).ravel().tolist(), "intrinsics": [70, 0, 32, 0, 70, 24, 0, 0, 1]}
-    return [json.dumps(content).encode()]
-
-
-def _traj(folder: Path) -> list[bytes]:
-    return [b"10.001 0.1 0.2 0.3 1 2 3\n10.1 0 0 0 0 0 0\n"]
-
-
+REALITYSCAN = (
+    b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\na.jpg,1,2,3,10,20,30,35,0.1,0.2,0.1,0,0,0,0.01,0\n"
+)
+POSE = np.eye(4).ravel().tolist()
+SCANNER_APP = json.dumps({"cameraPoseARFrame": POSE, "intrinsics": [70, 0, 32, 0, 70, 24, 0, 0, 1]}).encode()
+TRAJ = b"10.001 0.1 0.2 0.3 1 2 3\n10.1 0 0 0 0 0 0\n"
 DRIVE = "2013_05_28_drive_0000_sync"
-
-
-def _perspective(folder: Path) -> list[bytes]:
-    return [b"calib_time: x\nS_rect_00: 64 48\nP_rect_00: 70 0 32 0 0 70 24 0 0 0 1 0\n"]
-
-
-def _cam0_to_world(folder: Path) -> list[bytes]:
-    return [b"7 0 0 1 100 -1 0 0 200 0 -1 0 1.5 0 0 0 1\n"]
+PERSPECTIVE = b"calib_time: x\nS_rect_00: 64 48\nP_rect_00: 70 0 32 0 0 70 24 0 0 0 1 0\n"
+CAM0_TO_WORLD = b"7 0 0 1 100 -1 0 0 200 0 -1 0 1.5 0 0 0 1\n"
 
 
 def _e57(folder: Path) -> list[bytes]:
@@ -240,7 +226,10 @@ def _read_transforms(path: Path) -> list[np.ndarray]:
     return [view.camera.world_to_camera for image in images for view in in_pinholes(image)]
 
 
-READERS: dict[str, tuple[Callable, Callable]] = {
+LEFT_IMAGE = {f"data_2d_raw/{DRIVE}/image_00/data_rect/0000000007.png": PICTURE}
+POSES_FILE, CALIBRATION_FILE = f"data_poses/{DRIVE}/cam0_to_world.txt", "calibration/perspective.txt"
+ARKIT = {"lowres_wide/1_10.001.png": PICTURE, "lowres_wide_intrinsics/1_10.001.pincam": b"64 48 70 70 32 24"}
+READERS: dict[str, tuple[Callable | bytes, Callable]] = {
     "array.npy": (_npy, _read_npy),
     "scene.ogpc": (_ogpc, _read_ogpc),
     "cloud.ply": (_ply, lambda path: [read_points(path).xyz]),
@@ -252,47 +241,27 @@ READERS: dict[str, tuple[Callable, Callable]] = {
     "points3D.bin": (_points_bin, lambda path: [Points.from_world(colmap.read_points3d(path.parent)[0]).xyz]),
     "transforms.json": (_transforms, _read_transforms),
     "metashape.xml": (_metashape, _read_photogrammetry),
-    "realityscan.csv": (_realityscan, _read_photogrammetry),
+    "realityscan.csv": (REALITYSCAN, _read_photogrammetry),
     "polycam.json": (_polycam, _read_in_layout("keyframes/cameras/1.json", {"keyframes/images/1.png": PICTURE})),
-    "scanner_app.json": (_scanner_app, _read_in_layout("frame_00001.json", {"frame_00001.jpg": PICTURE})),
-    "lowres_wide.traj": (
-        _traj,
-        _read_in_layout(
-            "lowres_wide.traj",
-            {"lowres_wide/1_10.001.png": PICTURE, "lowres_wide_intrinsics/1_10.001.pincam": b"64 48 70 70 32 24"},
-        ),
+    "scanner_app.json": (
+        SCANNER_APP,
+        _read_in_layout("frame_00001.json", {"frame_00001.jpg": PICTURE}),
     ),
-    "perspective.txt": (
-        _perspective,
-        _read_in_layout(
-            "calibration/perspective.txt",
-            {
-                f"data_poses/{DRIVE}/cam0_to_world.txt": _cam0_to_world(Path())[0],
-                f"data_2d_raw/{DRIVE}/image_00/data_rect/0000000007.png": PICTURE,
-            },
-        ),
-    ),
-    "cam0_to_world.txt": (
-        _cam0_to_world,
-        _read_in_layout(
-            f"data_poses/{DRIVE}/cam0_to_world.txt",
-            {
-                "calibration/perspective.txt": _perspective(Path())[0],
-                f"data_2d_raw/{DRIVE}/image_00/data_rect/0000000007.png": PICTURE,
-            },
-        ),
-    ),
+    "lowres_wide.traj": (TRAJ, _read_in_layout("lowres_wide.traj", ARKIT)),
+    "perspective.txt": (PERSPECTIVE, _read_in_layout(CALIBRATION_FILE, LEFT_IMAGE | {POSES_FILE: CAM0_TO_WORLD})),
+    "cam0_to_world.txt": (CAM0_TO_WORLD, _read_in_layout(POSES_FILE, LEFT_IMAGE | {CALIBRATION_FILE: PERSPECTIVE})),
     "scan.e57": (_e57, lambda path: [read_points(path).xyz]),
     "image.jpg": (_images, lambda path: [np.array(image_size(path))]),
     "words.npz": (_words, lambda path: [read_text_features(path)[0].vectors]),
 }
-"""By the file's name: what makes valid ones, and what reads one and returns arrays that must be finite."""
+"""By the file's name: a valid one or what makes some, and what reads one and returns arrays that must be finite."""
 
 
 @lru_cache
 def valid_files(name: str, folder: Path) -> list[bytes]:
     (folder / name).mkdir()
-    return READERS[name][0](folder / name)
+    made = READERS[name][0]
+    return [made] if isinstance(made, bytes) else made(folder / name)
 
 
 @lru_cache

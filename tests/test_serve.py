@@ -1,5 +1,6 @@
 """The live page: who can reach it, what is refused, and a browser that types and clicks."""
 
+import importlib
 import json
 import shutil
 import signal
@@ -25,8 +26,10 @@ BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshad
 
 
 @pytest.fixture
-def viser():
-    return pytest.importorskip("viser")
+def pages():
+    """The module that serves, where viser is installed."""
+    pytest.importorskip("viser")
+    return importlib.import_module("og_pointcloud.show.serve")
 
 
 @pytest.fixture
@@ -41,11 +44,6 @@ def window():
         yield started.new_page(viewport={"width": 900, "height": 600})
 
 
-@pytest.fixture
-def bundle(tmp_path):
-    return write_bundle(room(500), tmp_path / "room.ogpc")
-
-
 def listens_at(port):
     """Addresses with a socket that listens at the port, as Linux has them."""
     rows = [
@@ -55,12 +53,10 @@ def listens_at(port):
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens")
-def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser, capsys):
-    from og_pointcloud.show.serve import ServeSettings, serve
-
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(pages, capsys):
     scene = LiveScene(og.LabelledScene.from_cloud(room(300)))
     for host, address, is_open in (("127.0.0.1", "0100007F", False), ("0.0.0.0", "00000000", True)):
-        page = serve({"room": scene}, ServeSettings(host, 0))
+        page = pages.serve({"room": scene}, pages.ServeSettings(host, 0))
         try:
             assert page.is_open == is_open
             assert page.url.startswith("http://127.0.0.1:")
@@ -70,13 +66,13 @@ def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_a_word_of_any_length_is_answered_in_a_few_lines(viser):
+def test_a_word_of_any_length_is_answered_in_a_few_lines(pages):
     answer = LiveScene(og.LabelledScene.from_cloud(room(300))).ask("chair" * 2000)
     assert len(answer.title) < 100
     assert all("is not among the" in line and len(line) < 1000 for line in answer.lines)
 
 
-def test_a_notebook_shows_the_page_in_its_cell(viser):
+def test_a_notebook_shows_the_page_in_its_cell(pages):
     page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
     try:
         assert f'<iframe src="{page.url}"' in page._repr_html_()
@@ -85,27 +81,23 @@ def test_a_notebook_shows_the_page_in_its_cell(viser):
         page.stop()
 
 
-def test_text_of_a_file_is_never_html(viser):
-    from og_pointcloud.show.serve import answer_html, legend_html
-
+def test_text_of_a_file_is_never_html(pages):
     name = "<img src=x onerror=alert(1)>"
     cloud = room(300)
     cloud = replace(cloud, vocabulary=Vocabulary((name, *cloud.vocabulary.names[1:]), cloud.vocabulary.vectors))
     live = LiveScene(og.LabelledScene.from_cloud(cloud))
     for text in (
-        answer_html(live.ask("")),
-        legend_html(live),
-        answer_html(Answer(name, (name,), ((name, 2.0),), name)),
+        pages.answer_html(live.ask("")),
+        pages.legend_html(live),
+        pages.answer_html(Answer(name, (name,), ((name, 2.0),), name)),
     ):
         assert "&lt;img src=x onerror" in text
         assert name not in text
 
 
-def test_the_legend_has_the_colors_of_the_points(viser):
-    from og_pointcloud.show.serve import legend_html
-
+def test_the_legend_has_the_colors_of_the_points(pages):
     live = LiveScene(og.LabelledScene.from_cloud(room(300)))
-    shown = legend_html(live)
+    shown = pages.legend_html(live)
     for name, color, count in live.legend():
         red, green, blue = color
         assert f'background:rgb({red}, {green}, {blue})"></i><span>{name}</span>' in shown
@@ -122,18 +114,17 @@ def test_the_legend_has_the_colors_of_the_points(viser):
         (["room.ogpc", "--cloud", "x.ply"], "--cloud is for one scene, but 2 are given"),
     ],
 )
-def test_bad_use_is_refused_in_one_line(viser, bundle, capsys, monkeypatch, options, said):
+def test_bad_use_is_refused_in_one_line(pages, bundle, capsys, monkeypatch, options, said):
     monkeypatch.chdir(bundle.parent)
     assert said in error_of(capsys, "serve", bundle, *options)
 
 
-def test_an_empty_scene_is_refused(viser, tmp_path, capsys):
+def test_an_empty_scene_is_refused(pages, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
     assert "empty has no point to show" in error_of(capsys, "serve", empty)
-    from og_pointcloud.show.serve import ServeSettings, serve
 
     with pytest.raises(og.SceneError, match=r"up is \(0, 0, 0\); expected a direction"):
-        serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, ServeSettings(up=(0, 0, 0)))
+        pages.serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, pages.ServeSettings(up=(0, 0, 0)))
 
 
 def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
@@ -145,7 +136,7 @@ def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(viser, bundle):
+def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(pages, bundle):
     command = [sys.executable, "-u", "-m", "og_pointcloud", "serve"]
     process = subprocess.Popen(
         [*command, bundle, "--port", "0"],
@@ -181,9 +172,7 @@ def until(true, seconds=60):
 
 
 @pytest.mark.slow
-def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser, window):
-    from og_pointcloud.show.serve import ServeSettings, serve
-
+def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, window):
     # Two plates, one above the other in the picture, each an instance of its own and of one color.
     plate = np.stack(np.meshgrid(np.arange(0, 2, 0.02), np.arange(0, 0.9, 0.02)), axis=-1).reshape(-1, 2)
     xyz = np.concatenate([np.c_[plate, np.zeros(len(plate))], np.c_[plate + np.array([0, 1.1]), np.zeros(len(plate))]])
@@ -191,7 +180,7 @@ def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser, windo
     live = LiveScene(og.LabelledScene.from_cloud(replace(cloud, rgb=np.full((len(xyz), 3), 200, np.uint8))))
     color = {name: live.colors()[live.ids == k][0].astype(int) for k, name in enumerate(("left", "right"))}
     assert len({tuple(value) for value in color.values()}) == 2
-    served = serve({"plates": live}, ServeSettings(port=0))
+    served = pages.serve({"plates": live}, pages.ServeSettings(port=0))
     try:
         window.goto(served.url)
         shown = {
@@ -257,7 +246,7 @@ def test_two_visits_are_colored_by_what_became_of_things(visits_of_a_place):
     assert set(nothing) == {[*CHANGES].index("as it was")}
 
 
-def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, viser, capsys, monkeypatch):
+def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, pages, capsys, monkeypatch):
     before, after, _ = visits_of_a_place
     monday, friday = (str(write_bundle(cloud, tmp_path / f"{day}.ogpc")) for day, cloud in
                       (("monday", before), ("friday", after)))  # fmt: skip
@@ -318,7 +307,7 @@ def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, windo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["points", "splats"])
-def test_three_js_draws_a_labelled_gltf(viser, tmp_path, window, kind):
+def test_three_js_draws_a_labelled_gltf(pages, tmp_path, window, kind):
     """In the page of viser, whose loader of glTF is that of three.js: it knows no splats, and draws their points."""
     from test_carriers import segmentation
     from test_formats_spz import splats
@@ -326,7 +315,7 @@ def test_three_js_draws_a_labelled_gltf(viser, tmp_path, window, kind):
     points = replace(splats(20_000, center=(3, -4, 5)), opacity=np.ones(20_000, np.float32))
     result = segmentation(np.arange(20_000) % 3, ["a", "b", "c"], points.xyz_world)
     path = result.save(tmp_path / "out.glb", points if kind == "splats" else None)
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = pages.viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         server.scene.add_glb("/labelled", path.read_bytes())
         server.initial_camera.position, server.initial_camera.look_at = (3, -4, 11), (3, -4, 5)

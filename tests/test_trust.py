@@ -47,10 +47,9 @@ from text_models import OUT
 import og_pointcloud as og
 from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
-from og_pointcloud.cli.common import write_json
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import locked, replacing, replacing_folder
+from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_json
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
