@@ -14,6 +14,8 @@ SPACE, WIDTH = "visits-test-space", 16
 SIZE, FOCAL_PX = (160, 120), 140.0
 SPACING = 0.04
 FLOOR = 1.6
+DIRECTIONS = np.linalg.qr(np.random.default_rng(0).normal(size=(WIDTH, WIDTH)))[0].astype(np.float32)
+"""A feature a row: the floor's, then those that things name."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,11 @@ def moved(thing: Thing, by: tuple[float, float, float]) -> Thing:
     return Thing((x, y, z), thing.size, thing.color, thing.feature)
 
 
-def cameras(count: int = 14, radius: float = 3.4, part: tuple[float, float] = (0, 1)) -> list[Camera]:
-    """On a circle, looking at the middle from above; of the circle, a part."""
+def cameras(
+    count: int = 14, radius: float = 3.4, part: tuple[float, float] = (0, 1), size: tuple[int, int] = SIZE
+) -> list[Camera]:
+    """On a circle, looking at the middle from above; of the circle, a part. size: of the images, of the same view."""
+    focal_px = FOCAL_PX * size[0] / SIZE[0]
     made = []
     for turn in np.linspace(*part, count, endpoint=False) * 2 * np.pi:
         center = np.array([radius * np.cos(turn), radius * np.sin(turn), 2.0])
@@ -49,7 +54,7 @@ def cameras(count: int = 14, radius: float = 3.4, part: tuple[float, float] = (0
         rotation = np.stack([right, np.cross(forward, right), forward])
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
-        made.append(Camera(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2, pose))
+        made.append(Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2, pose))
     return made
 
 
@@ -74,10 +79,12 @@ def cast(things: list[Thing], camera: Camera) -> tuple[NDArray[np.float32], NDAr
     return np.where(np.isfinite(depth), depth, 0).astype(np.float32), seen
 
 
-def surface(things: list[Thing], seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def surface(
+    things: list[Thing], seed: int = 0, spacing: float = SPACING
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Points strewn over floor and boxes but for what things stand on, and the thing of each, -1 floor."""
     random = np.random.default_rng(seed)
-    floor = random.uniform(-FLOOR, FLOOR, (int((2 * FLOOR / SPACING) ** 2), 2))
+    floor = random.uniform(-FLOOR, FLOOR, (int((2 * FLOOR / spacing) ** 2), 2))
     parts, owner = [np.c_[floor, np.zeros(len(floor))]], [np.full(len(floor), -1)]
     for row, thing in enumerate(things):
         low, size = np.array(thing.low), np.array(thing.size)
@@ -86,7 +93,7 @@ def surface(things: list[Thing], seed: int = 0) -> tuple[NDArray[np.float64], ND
         for axis in range(3):
             for side in (0, 1) if axis < 2 else (1,):
                 others = [a for a in range(3) if a != axis]
-                count = int(np.prod(size[others]) / SPACING**2)
+                count = int(np.prod(size[others]) / spacing**2)
                 face = np.empty((count, 3))
                 face[:, axis] = low[axis] + side * size[axis]
                 face[:, others] = low[others] + random.random((count, 2)) * size[others]
@@ -95,29 +102,34 @@ def surface(things: list[Thing], seed: int = 0) -> tuple[NDArray[np.float64], ND
     return np.concatenate(parts), np.concatenate(owner).astype(np.int32)
 
 
-def features(things: list[Thing], seen: NDArray[np.int32], seed: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """A view's masks, numbered at random, and their features; the floor has a mask too."""
+def features(
+    things: list[Thing], seen: NDArray[np.int32], seed: int, floor: bool = True
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """A view's masks, numbered at random, and their features. floor: whether it has a mask too."""
     random = np.random.default_rng(seed)
-    directions = np.linalg.qr(np.random.default_rng(0).normal(size=(WIDTH, WIDTH)))[0].astype(np.float32)
-    shown = [row for row in np.unique(seen).tolist() if row > -2]
+    shown = [row for row in np.unique(seen).tolist() if row > (-2 if floor else -1)]
     order = random.permutation(len(shown))
     ids = np.full(seen.shape, -1, np.int32)
     rows = np.zeros((len(shown), WIDTH), np.float32)
     for place, row in zip(order, shown, strict=True):
         ids[seen == row] = place
-        rows[place] = directions[0 if row < 0 else things[row].feature]
+        rows[place] = DIRECTIONS[0 if row < 0 else things[row].feature]
     return ids, rows + 0.05 * random.normal(size=rows.shape).astype(np.float32)
 
 
-def scene(things: list[Thing], views: list[Camera] | None = None, seed: int = 0) -> Scene:
+def scene(
+    things: list[Thing], views: list[Camera] | None = None, seed: int = 0, spacing: float = SPACING,
+    floor: bool = True, photographs: bool = False,
+) -> Scene:  # fmt: skip
     """A visit as a capture: points in the world frame whose origin is 0, and views."""
-    xyz, owner = surface(things, seed)
-    colors = np.array([(128, 128, 128), *(thing.color for thing in things)], np.uint8)
+    xyz, owner = surface(things, seed, spacing)
+    colors = np.array([(0, 0, 0), (128, 128, 128), *(thing.color for thing in things)], np.uint8)
     made = []
     for number, camera in enumerate(cameras() if views is None else views):
-        ids, rows = features(things, cast(things, camera)[1], seed * 100 + number)
-        made.append(View(f"view{number:03d}", camera, ids, rows))
-    points = Points(xyz.astype(np.float32), np.zeros(3), colors[owner + 1])
+        seen = cast(things, camera)[1]
+        ids, rows = features(things, seen, seed * 100 + number, floor)
+        made.append(View(f"view{number:03d}", camera, ids, rows, colors[seen + 2] if photographs else None))
+    points = Points(xyz.astype(np.float32), np.zeros(3), colors[owner + 2])
     return Scene(points, tuple(made), SPACE, f"visit {seed}")
 
 
