@@ -9,8 +9,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pinhole import looking, rays
 
-from og_pointcloud.formats.poses import in_local_frame, rigid
+from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 SIZE = np.array([4.0, 3.0, 2.5])
@@ -116,21 +117,14 @@ def _camera(random, index, count):
     """From a place in the middle, looking around, a little up or down, never level twice."""
     place = SIZE / 2 + random.uniform(-0.5, 0.5, 3)
     angle = 2 * np.pi * index / count + random.uniform(0, 0.2)
-    forward = np.array([np.cos(angle), np.sin(angle), random.uniform(-0.5, 0.3)])
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, *CENTER, rigid(rotation, -rotation @ place))
+    pose = looking(place, [np.cos(angle), np.sin(angle), random.uniform(-0.5, 0.3)])
+    return Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, *CENTER, pose)
 
 
 def _hits(camera):
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], -1)
-    rays = rays.reshape(-1, 3) @ camera.world_to_camera[:3, :3]
-    place = camera.center
+    along, place = rays(camera).reshape(-1, 3), camera.center
     with np.errstate(divide="ignore"):
-        reach = np.where(rays > 0, (SIZE - place) / rays, -place / rays)
+        reach = np.where(along > 0, (SIZE - place) / along, -place / along)
     axis = reach.argmin(axis=1)
-    rows = np.arange(len(rays))
-    return place + rays * reach[rows, axis, None], 2 * axis + (rays[rows, axis] > 0)
+    rows = np.arange(len(along))
+    return place + along * reach[rows, axis, None], 2 * axis + (along[rows, axis] > 0)

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pinhole import looking, rays
 
 from og_pointcloud.formats.depth import DepthFile, DepthFrame
 from og_pointcloud.scene import Camera
@@ -62,10 +63,11 @@ def write_tiny_capture(folder: Path, view_count: int = 6) -> TinyCapture:
     frames, features = [], {}
     for index in range(view_count):
         stem = f"view{index}"
-        camera_to_world = look_at(
-            2.6 * angle_vector(2 * np.pi * (index + 0.25) / view_count), target=np.array([0, 0, 0.4])
-        )
-        object_map = ray_cast(camera_to_world)
+        angle = 2 * np.pi * (index + 0.25) / view_count
+        eye = 2.6 * np.array([np.cos(angle), np.sin(angle), 0.6])
+        seen_by = Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2, looking(eye, [0, 0, 0.4] - eye))
+        object_map = ray_cast(seen_by)
+        camera_to_world = np.linalg.inv(seen_by.world_to_camera) @ np.diag([1, -1, -1, 1])  # OpenGL axes
         order = random.permutation(len(NAMES))  # mask ids mean nothing across views
         mask = np.append(order + 1, 0)[object_map].astype(np.uint16)
         cv2.imwrite(str(folder / "masks" / f"{stem}.png"), mask)
@@ -95,33 +97,16 @@ def sample_surfaces(per_ball: int = 500, floor_side: int = 24) -> tuple[NDArray[
     return xyz, np.repeat(np.array([0, 1, FLOOR], np.int32), [per_ball, per_ball, len(floor)])
 
 
-def angle_vector(angle: float) -> NDArray[np.float64]:
-    return np.array([np.cos(angle), np.sin(angle), 0.6])
-
-
-def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world (4, 4), OpenGL axes (x right, y up, z backward), world z up."""
-    backward = (position - target) / np.linalg.norm(position - target)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right)
-    camera_to_world = np.eye(4)
-    camera_to_world[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)
-    return camera_to_world
-
-
-def ray_cast(camera_to_world: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Object seen by each pixel, (HEIGHT, WIDTH) int32: a row of NAMES, or -1 (floor or sky)."""
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    in_camera = np.stack([(column - WIDTH / 2) / FOCAL_PX, -(row - HEIGHT / 2) / FOCAL_PX, -np.ones_like(row)], axis=-1)
-    direction = in_camera @ camera_to_world[:3, :3].T
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    nearest = np.full((HEIGHT, WIDTH), np.inf)
-    seen = np.full((HEIGHT, WIDTH), FLOOR, np.int32)
-    for index, center in enumerate(CENTERS):
-        along = direction @ (center - camera_to_world[:3, 3])
-        miss_squared = ((center - camera_to_world[:3, 3]) ** 2).sum() - along**2
-        distance = np.where(miss_squared < RADIUS**2, along - np.sqrt(np.maximum(RADIUS**2 - miss_squared, 0)), np.inf)
-        seen[distance < nearest] = index
+def ray_cast(camera: Camera, centers: NDArray[np.float64] = CENTERS, radius: float = RADIUS) -> NDArray[np.int32]:
+    """(H, W) int32: the ball that each pixel's ray meets first, a row of NAMES; -1 none."""
+    ray = rays(camera)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    nearest, seen = np.full(ray.shape[:2], np.inf), np.full(ray.shape[:2], -1, np.int32)
+    for ball, center in enumerate(centers):
+        along = ray @ (center - camera.center)
+        missed = ((center - camera.center) ** 2).sum() - along**2
+        distance = np.where(missed < radius**2, along - np.sqrt(np.maximum(radius**2 - missed, 0)), np.inf)
+        seen[distance < nearest] = ball
         nearest = np.minimum(nearest, distance)
     return seen
 
@@ -153,23 +138,13 @@ def room_poses(count: int = 12, offset=(0.0, 0.0, 0.0)):
     for index in range(count):
         angle = 2 * np.pi * index / count
         eye = np.array([2 + 1.5 * np.cos(angle), 1.5 + 1.1 * np.sin(angle), 1.3])
-        forward = np.array([2.0, 1.5, 0.5 if index % 2 else 1.0]) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, eye + offset], axis=1)
-        made.append(pose)
+        made.append(np.linalg.inv(looking(eye + offset, [2.0, 1.5, 0.5 if index % 2 else 1.0] - eye)))
     return made
 
 
 def look(pose, offset=(0.0, 0.0, 0.0), size=ROOM_SIZE, intrinsics=None):
     """Exact depth (H, W) float64 and colours (H, W, 3) of the room. intrinsics: fx fy cx cy, pixel centres at +0.5."""
-    width, height = size
-    fx, fy, cx, cy = intrinsics or default_intrinsics(size)
-    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
-    ray = np.stack([x, y, np.ones_like(x)], axis=2) @ pose[:3, :3].T
-    eye = pose[:3, 3] - offset
+    ray, eye = rays(camera(pose, size, intrinsics)), pose[:3, 3] - offset
     with np.errstate(divide="ignore"):
         to_walls = np.where(ray > 0, ROOM[1] - eye, ROOM[0] - eye) / ray
         enters, leaves = np.sort(np.stack([(CRATE[0] - eye) / ray, (CRATE[1] - eye) / ray]), axis=0)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
+from pinhole import looking, rays
 
 from og_pointcloud.scene import Camera, Points, Scene, View
 
@@ -134,9 +135,7 @@ class Street:
     def image(self, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: what the camera sees."""
         owner, depth = self.look(camera)
-        column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
-        place = (rays * depth[..., None]) @ camera.world_to_camera[:3, :3] + camera.center
+        place = rays(camera) * depth[..., None] + camera.center
         return colours(place.reshape(-1, 3), owner.ravel()).reshape(*owner.shape, 3)
 
 
@@ -206,13 +205,7 @@ def drive(length_m: float, views: int, image: tuple[int, int]) -> list[Camera]:
     for index in range(views):
         stop, heading = index // len(HEADINGS_DEG), np.radians(HEADINGS_DEG[index % len(HEADINGS_DEG)])
         eye = np.array([length_m * (stop + 0.5) / stops, 0.8 * (-1) ** stop, 1.9])
-        forward = np.array([np.cos(heading), np.sin(heading), 0.06])
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, (0, 0, 1.0))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = [right, np.cross(forward, right), forward]
-        pose[:3, 3] = -pose[:3, :3] @ eye
+        pose = looking(eye, [np.cos(heading), np.sin(heading), 0.06])
         cameras.append(Camera(width, height, 0.6 * width, 0.6 * width, width / 2, height / 2, pose))
     return cameras
 

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from pinhole import rays
 from scenes import camera, distance_to_surface, look, write_image
 
 from og_pointcloud.cli import main
@@ -36,10 +37,7 @@ def photograph(pose):
     from scipy.ndimage import map_coordinates
 
     depth, _ = look(pose, size=SIZE)
-    lens = camera(pose, SIZE)
-    column, row = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
-    ray = np.stack([(column - lens.cx) / lens.fx, (row - lens.cy) / lens.fy, np.ones_like(column)], axis=2)
-    xyz = (ray * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    xyz = rays(camera(pose, SIZE)) * depth[..., None] + pose[:3, 3]
     shade = np.zeros(depth.shape)
     for octave, fineness in enumerate((4, 9, 19, 37)):
         volume = np.random.default_rng(octave).normal(size=(32, 32, 32))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pinhole import looking, rays
 
 import og_pointcloud as og
 from og_pointcloud.scene import Camera, Points, Scene, View
@@ -48,31 +49,22 @@ def cameras(
     made = []
     for turn in np.linspace(*part, count, endpoint=False) * 2 * np.pi:
         center = np.array([radius * np.cos(turn), radius * np.sin(turn), 2.0])
-        forward = -center / np.linalg.norm(center)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
-        made.append(Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2, pose))
+        made.append(Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2, looking(center, -center)))
     return made
 
 
 def cast(things: list[Thing], camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """(H, W) depth along the axis, 0 beyond the floor, and what is seen: a row of things, -1 floor, -2 nothing."""
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    rays = rays @ camera.world_to_camera[:3, :3]
-    center = camera.center
-    depth, seen = np.full(u.shape, np.inf), np.full(u.shape, -2, np.int32)
+    along, center = rays(camera), camera.center
+    depth, seen = np.full(along.shape[:2], np.inf), np.full(along.shape[:2], -2, np.int32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_floor = -center[2] / rays[..., 2]
-        hits = center + to_floor[..., None] * rays
+        to_floor = -center[2] / along[..., 2]
+        hits = center + to_floor[..., None] * along
         on_floor = (to_floor > 0) & (np.abs(hits[..., :2]).max(axis=-1) < FLOOR)
         depth[on_floor], seen[on_floor] = to_floor[on_floor], -1
         for row, thing in enumerate(things):
-            low = (np.array(thing.low) - center) / rays
-            high = (np.array(thing.low) + thing.size - center) / rays
+            low = (np.array(thing.low) - center) / along
+            high = (np.array(thing.low) + thing.size - center) / along
             enters, leaves = np.minimum(low, high).max(axis=-1), np.maximum(low, high).min(axis=-1)
             hit = (enters < leaves) & (enters > 0) & (enters < depth)
             depth[hit], seen[hit] = enters[hit], row

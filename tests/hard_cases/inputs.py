@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pinhole import looking
 from reference_splatting import pixel_weights, reference_pixel_weights
+from scenes import ray_cast
 from scipy.sparse import csr_array
 
 from hard_cases import naive
@@ -118,7 +120,9 @@ def two_balls(
         seen = camera(48, 36, 40.0, _around(2 * np.pi * index / views + 0.3))
         # The pose in the world, then in the cloud's frame, as readers do it.
         world_camera = in_local_frame(_scaled(seen, size), -np.asarray(origin, np.float64))
-        made.append(View(f"view{index}", in_local_frame(world_camera, cloud.origin), _ball_map(seen), features))
+        made.append(
+            View(f"view{index}", in_local_frame(world_camera, cloud.origin), ray_cast(seen, BALLS, RADIUS), features)
+        )
     return Scene(cloud, tuple(made), SPACE), np.repeat(np.array([0, 1], np.int32), points)
 
 
@@ -178,29 +182,10 @@ def by_ball(ids: NDArray[np.int32], balls: NDArray[np.int32]) -> NDArray[np.int3
 
 def _around(angle: float) -> NDArray[np.float64]:
     """World-to-camera of a camera 2.6 from the origin that looks at it, a little from above."""
-    forward = -np.array([np.cos(angle), np.sin(angle), 0.5])
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return rigid(rotation, rotation @ forward * 2.6)
+    toward = np.array([np.cos(angle), np.sin(angle), 0.5])
+    return looking(2.6 * toward / np.linalg.norm(toward), -toward)
 
 
 def _scaled(seen: Camera, size: float) -> Camera:
     rotation, translation = seen.world_to_camera[:3, :3], seen.world_to_camera[:3, 3]
     return Camera(seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy, rigid(rotation, size * translation))
-
-
-def _ball_map(seen: Camera) -> NDArray[np.int32]:
-    """(H, W) int32: the ball that each pixel's ray meets first, -1 none."""
-    column, row = np.meshgrid(np.arange(seen.width) + 0.5, np.arange(seen.height) + 0.5)
-    ray = np.stack([(column - seen.cx) / seen.fx, (row - seen.cy) / seen.fy, np.ones_like(row)], axis=-1)
-    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ seen.world_to_camera[:3, :3]
-    nearest, ids = np.full(row.shape, np.inf), np.full(row.shape, -1, np.int32)
-    for ball, center in enumerate(BALLS):
-        along = ray @ (center - seen.center)
-        missed = ((center - seen.center) ** 2).sum() - along**2
-        distance = np.where(missed < RADIUS**2, along - np.sqrt(np.maximum(RADIUS**2 - missed, 0)), np.inf)
-        ids[distance < nearest] = ball
-        nearest = np.minimum(nearest, distance)
-    return ids
