@@ -23,6 +23,16 @@ def place_of(frame):
     return pose[:3, 3], np.append(np.array([x, y, z]) / (4 * w), w)
 
 
+def transform(make, parent, child, translation, rotation, stamp):
+    """tf2_msgs/TFMessage of one: the child in its parent, by a translation (3,) and a quaternion x y z w."""
+    place = make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, translation), strict=True)))
+    turn = make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, rotation), strict=True)))
+    moved = make("geometry_msgs/msg/Transform", translation=place, rotation=turn)
+    head = header(make, parent, stamp)
+    stamped = make("geometry_msgs/msg/TransformStamped", header=head, child_frame_id=child, transform=moved)
+    return make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
 def image_message(make, array, encoding, stamp):
     """sensor_msgs/Image of an array (H, W) or (H, W, 3)."""
     height, width = array.shape[:2]

@@ -61,35 +61,35 @@ def groups_of(table: MaskTable, settings: GroupingSettings = SETTINGS) -> NDArra
 A, B = range(50), range(50, 100)
 
 
-def test_two_objects_seen_by_all_views_are_two_groups() -> None:
-    table = hand_table(100, [[(A, ONE), (B, OTHER)]] * 4)
-    np.testing.assert_array_equal(groups_of(table), [0, 1] * 4)
+PARTS = [(range(25), ONE), (range(25, 50), ONE)]
+NOTHING = np.zeros(8, np.float32)
+PLAIN: dict[str, tuple[list[HandView], list[int]]] = {
+    "two objects seen by all views are two groups": ([[(A, ONE), (B, OTHER)]] * 4, [0, 1] * 4),
+    "objects with the same feature stay apart": ([[(A, ONE), (B, ONE)]] * 4, [0, 1] * 4),
+    "objects without features stay apart": ([[(A, NOTHING), (B, NOTHING)]] * 3, [0, 1] * 3),
+    "masks of one extent join whatever their features": ([[(A, ONE), (B, OTHER)], [(A, OTHER), (B, ONE)]], [0, 1] * 2),
+    "groups are numbered by what they show": ([[(range(10), ONE), (range(10, 100), OTHER)]] * 3, [1, 0] * 3),
+    "parts come together where other views show the whole": (
+        [[*PARTS, (B, OTHER)], *[[(A, ONE), (B, OTHER)]] * 3], [0, 0, 1, 0, 1, 0, 1, 0, 1]
+    ),
+    "parts that no view shows whole stay apart": ([PARTS] * 4, [0, 1] * 4),
+    "one other view is enough to show that a mask spans": (
+        [[(range(90), ONE)], [(range(start, start + 30), ONE) for start in (0, 30, 60)]], [-1, 0, 1, 2]
+    ),
+    "a mask that shows nothing belongs to no group": ([[(A, ONE), ([], OTHER)], [(A, ONE)]], [0, -1, 0]),
+    "one view gives one group a mask": ([[(range(start, 100, 3), ONE) for start in range(3)]], [0, 1, 2]),
+}  # fmt: skip
+"""What it shows -> views, and the group of each mask."""
 
 
-def test_objects_with_the_same_feature_stay_apart() -> None:
-    table = hand_table(100, [[(A, ONE), (B, ONE)]] * 4)
-    np.testing.assert_array_equal(groups_of(table), [0, 1] * 4)
+@pytest.mark.parametrize("shows", PLAIN)
+def test_groups_of_plain_views(shows: str) -> None:
+    views, expected = PLAIN[shows]
+    np.testing.assert_array_equal(groups_of(hand_table(100, views)), expected)
 
 
-def test_masks_of_the_same_extent_join_whatever_their_features() -> None:
-    table = hand_table(100, [[(A, ONE), (B, OTHER)], [(A, OTHER), (B, ONE)]])
-    np.testing.assert_array_equal(groups_of(table), [0, 1, 0, 1])
-
-
-def test_groups_are_numbered_by_what_they_show() -> None:
-    table = hand_table(100, [[(range(10), ONE), (range(10, 100), OTHER)]] * 3)
-    np.testing.assert_array_equal(groups_of(table), [1, 0] * 3)
-
-
-def test_parts_come_together_where_other_views_show_the_whole() -> None:
-    parts = [(range(25), ONE), (range(25, 50), ONE), (B, OTHER)]
-    table = hand_table(100, [parts, *[[(A, ONE), (B, OTHER)]] * 3])
-    np.testing.assert_array_equal(groups_of(table), [0, 0, 1, 0, 1, 0, 1, 0, 1])
-
-
-def test_parts_that_no_view_shows_whole_stay_apart() -> None:
-    parts = [(range(25), ONE), (range(25, 50), ONE)]
-    assert len(set(groups_of(hand_table(50, [parts] * 4)))) == 2
+def test_masks_without_common_points_are_groups_of_their_own() -> None:
+    np.testing.assert_array_equal(groups_of(hand_table(100, [[(A, ONE)], [(B, ONE)]], [B, A])), [0, 1])
 
 
 @pytest.mark.parametrize("spanning_views", [1, 2])
@@ -106,11 +106,6 @@ def test_a_mask_that_spans_many_things_is_left_out() -> None:
     groups = group_masks(table, SETTINGS)
     np.testing.assert_array_equal(groups.spanning, [True] + [False] * 6)
     np.testing.assert_array_equal(groups.group, [-1, 0, 1, 2, 0, 1, 2])
-
-
-def test_one_other_view_is_enough_to_show_that_a_mask_spans() -> None:
-    thirds = [(range(start, start + 30), ONE) for start in (0, 30, 60)]
-    np.testing.assert_array_equal(groups_of(hand_table(90, [[(range(90), ONE)], thirds])), [-1, 0, 1, 2])
 
 
 def test_a_spanning_mask_holds_nothing() -> None:
@@ -170,25 +165,10 @@ def test_a_view_that_saw_a_sliver_is_no_witness() -> None:
     assert group[1] == group[3] != group[2] == group[4]
 
 
-def test_masks_without_common_points_are_groups_of_their_own() -> None:
-    table = hand_table(100, [[(A, ONE)], [(B, ONE)]], [B, A])
-    np.testing.assert_array_equal(groups_of(table), [0, 1])
-
-
 def test_no_mask_at_all() -> None:
     table = hand_table(10, [[], []])
     groups = group_masks(table, SETTINGS)
     assert groups.count == len(groups.group) == len(groups.spanning) == 0
-
-
-def test_a_mask_that_shows_nothing_belongs_to_no_group() -> None:
-    table = hand_table(100, [[(A, ONE), ([], OTHER)], [(A, ONE)]])
-    np.testing.assert_array_equal(groups_of(table), [0, -1, 0])
-
-
-def test_one_view_gives_one_group_per_mask() -> None:
-    table = hand_table(100, [[(range(0, 100, 3), ONE), (range(1, 100, 3), ONE), (range(2, 100, 3), ONE)]])
-    np.testing.assert_array_equal(groups_of(table), [0, 1, 2])
 
 
 def test_cuts_at_different_places_keep_what_they_agree_on() -> None:
@@ -206,12 +186,6 @@ def test_masks_that_contradict_each_other_everywhere_are_not_joined() -> None:
     group = groups_of(hand_table(100, [halves, even_odd]))
     assert len(set(group) - {-1}) == 4 or (group == -1).all()
     assert groups_of(hand_table(100, [thirds, halves])).shape == (6,)
-
-
-def test_zero_features_still_group() -> None:
-    nothing = np.zeros(8, np.float32)
-    table = hand_table(100, [[(A, nothing), (B, nothing)]] * 3)
-    np.testing.assert_array_equal(groups_of(table), [0, 1] * 3)
 
 
 def test_indicator() -> None:

@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip("rosbags")
 
 from commands import run
-from frame_messages import messages_of, place_of, stamp_of
+from frame_messages import messages_of, place_of, stamp_of, transform
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
 from og_pointcloud_ros.frames import FrameAssembler, image_array
 from og_pointcloud_ros.map_bags import BagFrames
-from og_pointcloud_ros.messages import header, plain_messages
+from og_pointcloud_ros.messages import plain_messages
 from rosbags.rosbag2 import Writer
 from visits import BIN, CHEST, CRATE, SPACE, frames, instance_of
 
@@ -35,13 +35,7 @@ def write_bag(folder, given, without=(), messages=messages_of):
         kinds["/tf"] = "tf2_msgs/msg/TFMessage"
         out = {t: bag.add_connection(t, kind, typestore=store) for t, kind in kinds.items() if t not in without}
         for recorded, frame in enumerate(given):
-            (x, y, z), (qx, qy, qz, qw) = (map(float, part) for part in place_of(frame))
-            stamp, place = stamp_of(frame), make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-            turn = make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
-            where = make("geometry_msgs/msg/TransformStamped", header=header(make, "map", stamp),
-                         child_frame_id="camera", transform=make("geometry_msgs/msg/Transform", translation=place,
-                                                                 rotation=turn))  # fmt: skip
-            sent = {"/tf": make("tf2_msgs/msg/TFMessage", transforms=[where])}
+            sent = {"/tf": transform(make, "map", "camera", *place_of(frame), stamp_of(frame))}
             sent |= {TOPICS[role]: message for role, message in messages(make, frame).items()}
             for topic in out:
                 bag.write(out[topic], recorded, store.serialize_cdr(sent[topic], kinds[topic]))

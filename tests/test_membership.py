@@ -70,51 +70,42 @@ def ids_of(views: Sequence[HandView], numbers: Sequence[int], unseen: Sequence[I
     return decide(hand_table(N, views, unseen), numbers).instance_ids.tolist()
 
 
-def test_inside_the_masks_is_the_instance_outside_is_background() -> None:
-    assert ids_of([[(OBJECT, ONE)]] * 4, [0] * 4) == [0] * 50 + [BACKGROUND] * 50
+ON_A_LINE: dict[str, tuple[list[HandView], list[int], list[tuple[int, int]]]] = {
+    "inside the masks is the instance, outside is background": ([[(OBJECT, ONE)]] * 4, [0] * 4, [(0, 50), (-1, 50)]),
+    "two instances": (
+        [[(range(30), ONE), (range(30, 70), ONE)]] * 4, [0, 1] * 4, [(0, 30), (1, 40), (-1, 30)]
+    ),
+    "a detector that misses in seven views of ten keeps its instance: they say nothing": (
+        [*[[(OBJECT, ONE)]] * 3, *[[]] * 7], [0] * 3, [(0, 50), (-1, 50)]
+    ),
+    "background that masks cover in one view of seven, or three of seven far away, stays background": (
+        [[(range(60), ONE)], *[[([*OBJECT, *range(80, 90)], ONE)]] * 3, *[[(OBJECT, ONE)]] * 3], [0] * 7,
+        [(0, 50), (-1, 50)],
+    ),
+    "a rim that two views of four cut off joins the instance that it adjoins": (
+        [*[[(range(45), ONE)]] * 2, *[[(OBJECT, ONE)]] * 2], [0] * 4, [(0, 50), (-1, 50)]
+    ),
+    "a point amid background, shown in every mask by rays that slip past the object, is let go": (
+        [[([*OBJECT, 80], ONE)]] * 4, [0] * 4, [(0, 50), (-1, 50)]
+    ),
+    "two points amid background, which counts half to them, keep each other": (
+        [[([*OBJECT, 80, 81], ONE)]] * 4, [0] * 4, [(0, 50), (-1, 30), (0, 2), (-1, 18)]
+    ),
+    "points at share 0.5 in a row are reached from the sure ones, those at 0.17 behind them are not": (
+        [[(range(N), ONE)], *[[(range(90), ONE)]] * 2, *[[(OBJECT, ONE)]] * 3], [0] * 6, [(0, 90), (-1, 10)]
+    ),
+    "masks without a group have no say": (
+        [[(OBJECT, ONE), (range(50, N), ONE)]] * 3, [0, -1] * 3, [(0, 50), (-1, 50)]
+    ),
+    "of groups that cover a point alike the lower is taken": ([[(OBJECT, ONE)]] * 2, [1, 0], [(0, 50), (-1, 50)]),
+}  # fmt: skip
+"""What it shows -> views, the group of each mask, and the ids of the line: which, and of how many points."""
 
 
-def test_two_instances() -> None:
-    ids = ids_of([[(range(30), ONE), (range(30, 70), ONE)]] * 4, [0, 1] * 4)
-    assert ids == [0] * 30 + [1] * 40 + [BACKGROUND] * 30
-
-
-def test_a_detector_that_misses_often_keeps_its_instance() -> None:
-    """Seven views of ten have no mask: they say nothing."""
-    assert ids_of([*[[(OBJECT, ONE)]] * 3, *[[]] * 7], [0] * 3) == [0] * 50 + [BACKGROUND] * 50
-
-
-def test_background_that_few_masks_of_the_instance_cover_stays_background() -> None:
-    """Ten points beside the object slip into its mask in one view of seven, ten far away in three of seven."""
-    wide = [(range(60), ONE)]
-    far = [([*OBJECT, *range(80, 90)], ONE)]
-    ids = ids_of([wide, far, far, far, *[[(OBJECT, ONE)]] * 3], [0] * 7)
-    assert ids == [0] * 50 + [BACKGROUND] * 50
-
-
-def test_a_torn_rim_joins_the_instance_it_adjoins() -> None:
-    """Two views of four cut five points off the end of the object."""
-    torn = [(range(45), ONE)]
-    assert ids_of([torn, torn, [(OBJECT, ONE)], [(OBJECT, ONE)]], [0] * 4) == [0] * 50 + [BACKGROUND] * 50
-
-
-def test_a_point_amid_background_is_let_go() -> None:
-    """Rays that slip past the object show one point behind it in every mask, and its eight neighbours in none."""
-    ids = ids_of([[([*OBJECT, 80], ONE)]] * 4, [0] * 4)
-    assert ids == [0] * 50 + [BACKGROUND] * 50
-
-
-def test_two_points_amid_background_hold_together() -> None:
-    """To points of an instance background counts half: the two keep each other."""
-    ids = ids_of([[([*OBJECT, 80, 81], ONE)]] * 4, [0] * 4)
-    assert ids == [0] * 50 + [BACKGROUND] * 30 + [0] * 2 + [BACKGROUND] * 18
-
-
-def test_growth_follows_the_surface_but_not_into_less_likely_points() -> None:
-    """Forty points at share 0.5 in a row are reached from the sure ones; those at 0.17 behind them are not."""
-    long, short = [(range(90), ONE)], [(OBJECT, ONE)]
-    views = [[(range(N), ONE)], long, long, short, short, short]
-    assert ids_of(views, [0] * 6) == [0] * 90 + [BACKGROUND] * 10
+@pytest.mark.parametrize("shows", ON_A_LINE)
+def test_states_of_points_on_a_line(shows: str) -> None:
+    views, numbers, runs = ON_A_LINE[shows]
+    assert ids_of(views, numbers) == [state for state, count in runs for _ in range(count)]
 
 
 def test_growth_does_not_jump_over_a_gap() -> None:
@@ -151,10 +142,6 @@ def test_a_group_of_which_no_point_is_sure_is_dismissed() -> None:
     result = decide(hand_table(N, views), [0] * 4 + [1, 0])
     assert result.dismissed.tolist() == [False, True]
     assert result.instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
-
-
-def test_masks_without_a_group_have_no_say() -> None:
-    assert ids_of([[(OBJECT, ONE), (range(50, N), ONE)]] * 3, [0, -1] * 3) == [0] * 50 + [BACKGROUND] * 50
 
 
 @pytest.mark.parametrize("numbers", [[], [-1, -1]])
@@ -449,11 +436,6 @@ def test_a_small_thing_that_half_of_the_views_let_a_large_one_swallow_keeps_its_
     table = hand_table(100, [known] * 4 + [[(shelf, ONE)]] * 5)
     ids = decide(table, [0, 1] * 4 + [0] * 5).instance_ids
     assert ids.tolist() == [0] * 80 + [1] * 20
-
-
-def test_of_groups_that_cover_a_point_alike_the_lower_is_taken() -> None:
-    ids = ids_of([[(OBJECT, ONE)], [(OBJECT, ONE)]], [1, 0])
-    assert ids == [0] * 50 + [BACKGROUND] * 50
 
 
 def test_instance_area_is_what_the_masks_of_its_instance_show_of_a_point() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import error_of, run
+from frame_messages import transform
 from labelled_clouds import room
 from og_pointcloud_export import write_bundle
 
@@ -15,7 +16,6 @@ pytest.importorskip("rosbags")
 
 from og_pointcloud_ros import from_pointcloud2, read_fields, write_fields
 from og_pointcloud_ros.bags import label_bag, open_bag, ros2_types, rosbags_messages
-from og_pointcloud_ros.messages import header
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 import og_pointcloud as og
@@ -32,14 +32,8 @@ def scene(tmp_path_factory):
     return og.load(write_bundle(room(1500), tmp_path_factory.mktemp("bags") / "room.ogpc"))
 
 
-def transform(parent, child, translation, stamp, yaw=0.0):
-    turn = MAKE("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(yaw / 2), w=np.cos(yaw / 2))
-    place = MAKE("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, translation), strict=True)))
-    moved = MAKE("geometry_msgs/msg/Transform", translation=place, rotation=turn)
-    stamped = MAKE(
-        "geometry_msgs/msg/TransformStamped", header=header(MAKE, parent, stamp), child_frame_id=child, transform=moved
-    )
-    return MAKE("tf2_msgs/msg/TFMessage", transforms=[stamped])
+def turned(parent, child, translation, stamp, yaw):
+    return transform(MAKE, parent, child, translation, (0, 0, np.sin(yaw / 2), np.cos(yaw / 2)), stamp)
 
 
 def pose_at(k):
@@ -71,12 +65,12 @@ def write_drive(folder, scene, storage=StoragePlugin.SQLITE3, compressed=None, f
         def write(topic, stamp, message):
             bag.write(topics[topic], stamp, STORE.serialize_cdr(message, kinds[topic]))
 
-        write("/tf_static", 1, transform("base", "lidar", (0, 0, 0.5), 1, np.pi / 2))
+        write("/tf_static", 1, turned("base", "lidar", (0, 0, 0.5), 1, np.pi / 2))
         for k in range(CLOUDS):
             # Midway between two transforms: every other one is left out, so that the cloud's own has to be found.
             for half in (-0.5, 0.5):
                 moment = round((k + 1 + half) * SECOND)
-                write("/tf", moment, transform("map", "base", (0.2 * (k + half), 0, 0), moment, 0.1 * (k + half)))
+                write("/tf", moment, turned("map", "base", (0.2 * (k + half), 0, 0), moment, 0.1 * (k + half)))
             stamp = (k + 1) * SECOND
             rows = np.zeros(len(scene.xyz[k::7]), [("intensity", "<f4"), *((axis, "<f4") for axis in "zyx")])
             for axis, values in zip("xyz", in_lidar(scene, k).T, strict=True):
@@ -241,7 +235,7 @@ def test_transforms_without_sense_are_left_out(scene, tmp_path):
             bag.write(copies[old.id], stamp, data)
         (static,) = (old for old in reader.connections if old.topic == "/tf_static")
         bag.write(
-            copies[static.id], 3, STORE.serialize_cdr(transform("base", "arm", (np.nan, 0, 0), 1), static.msgtype)
+            copies[static.id], 3, STORE.serialize_cdr(turned("base", "arm", (np.nan, 0, 0), 1, 0.0), static.msgtype)
         )
         bag.write(copies[static.id], 4, b"\0\1\0\0\7")
     with pytest.warns(UserWarning, match="2 messages of transforms left out"):
