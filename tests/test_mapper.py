@@ -443,6 +443,20 @@ def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path
     assert (again.last_stamp, again.points) == (third.stamp, mapper.points)
 
 
+def test_a_whole_map_that_cannot_be_written_costs_no_frame(tmp_path, monkeypatch):
+    from og_pointcloud.mapping import map_journal
+
+    def full(path):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(map_journal, "LOG_BYTES", 1000)
+    monkeypatch.setattr(map_journal, "replacing", full)
+    mapper = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    with pytest.warns(UserWarning, match=r"map.state cannot be written \(No space left"):
+        mapper.integrate(frames(THINGS)[0])
+    assert og.Mapper(feature_space=SPACE, journal=tmp_path).points == mapper.points > 0
+
+
 def test_a_frame_that_failed_fails_again_and_the_map_goes_on(tmp_path, monkeypatch):
     module, given = sys.modules["og_pointcloud.mapping.mapper"], frames(THINGS)[:3]
     vote = module.vote

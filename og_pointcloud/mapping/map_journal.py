@@ -15,6 +15,7 @@ import io
 import json
 import os
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -138,13 +139,19 @@ class MapJournal:
                 raise
 
     def settle(self, known: GrowingMap) -> None:
-        """Once the log is long, write the map that it led to, and begin the log anew."""
-        if self._file is not None and self._file.tell() > LOG_BYTES:
-            with naming(self.folder):
-                with replacing(self._state) as file:
-                    file.write(_record((self._origin, known)))
-                self._file.close()
-                self._file = self._log.open("wb", buffering=0)
+        """Once the log is long, write the map that it led to, and begin the log anew. Where that fails, as on a full
+        disk, the log goes on: it has all changes."""
+        if self._file is None or self._file.tell() <= LOG_BYTES:
+            return
+        try:
+            with replacing(self._state) as file:
+                file.write(_record((self._origin, known)))
+        except OSError as error:
+            what = f"{self._state} cannot be written ({error.strerror}): its log of changes grows on"
+            warnings.warn(what, stacklevel=4)
+            return
+        with naming(self.folder):
+            self._file.truncate(0)
 
 
 def _record(value: Any) -> bytes:
