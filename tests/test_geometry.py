@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from og_pointcloud.rendering import geometry
 from og_pointcloud.rendering.geometry import (
+    FLOATER,
     TAMED_BY,
     along_curve,
     chance_of_place,
+    drawn_spacing,
     near_plane,
     nearest_in,
     neighbourhood,
@@ -84,6 +86,21 @@ def test_a_floater_has_the_spacing_of_the_surface_it_left() -> None:
     assert around.spacing[-1] <= 1.5
     assert not around.adjoining[-1].any()
     assert not (around.adjoining & (around.index == 100)).any()
+
+
+def test_only_points_that_float_far_apart_in_all_directions_are_drawn_small(random: Generator) -> None:
+    """A room's floor, a far wall of a tenth of its density, and floaters above the floor as far apart as the wall's."""
+    floor, wall = grid(40), grid(8, 10.0)[:, [0, 2, 1]]
+    wall[:, 1] += random.normal(500, 1, 64)
+    floaters = random.uniform([0, 0, 100], [40, 40, 140], (64, 3))
+    xyz = np.concatenate([floor, wall, floaters]).astype(np.float32)
+    around = neighbourhood(xyz, SETTINGS)
+    drawn = drawn_spacing(xyz, around)
+    assert np.median(around.spacing[1664:]) > 3, "they are no neighbours of the floor"
+    assert np.mean(np.isclose(drawn[1664:], FLOATER)) > 0.8, (
+        "but for some at their rim, whose neighbours lie to one side"
+    )
+    np.testing.assert_array_equal(drawn[:1664], around.spacing[:1664])
 
 
 def test_duplicates_have_the_spacing_of_the_scene() -> None:

@@ -17,6 +17,7 @@ from og_pointcloud.fitting.held_out import CLEARLY, STEP, agreement, choose_scal
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import near_plane, neighbourhood
+from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -30,7 +31,8 @@ def chosen(scene: Scene, settings: FitSettings | None = None):
     settings = settings or FitSettings()
     spacing = neighbourhood(scene.points.xyz, settings.geometry).spacing
     near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
-    return choose_scale(scene.points, spacing, scene.views, near, settings, Journal(progress=False))
+    thickness = sight_thickness(spacing, float(np.median(spacing)), settings.geometry)
+    return choose_scale(scene.points, spacing, thickness, scene.views, near, settings, Journal(progress=False))
 
 
 def test_the_best_on_held_out_views_is_taken(scene: Scene) -> None:

@@ -191,7 +191,7 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
 
 def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     cloud = TiledCloud.cut(points, len(points), SETTINGS, work)
-    work.array("spacing", cloud.key, lambda: np.full(len(points), spacing, np.float32))
+    work.array("spacing", cloud.key, lambda: np.full((2, len(points)), spacing, np.float32))
     return cloud
 
 

@@ -24,7 +24,6 @@ from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
-from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
@@ -51,6 +50,7 @@ class ScaleChoice:
 def choose_scale(
     points: Points,
     spacing: NDArray[np.float32],
+    thickness: NDArray[np.float32],
     views: Sequence[View],
     near: float,
     settings: FitSettings,
@@ -59,8 +59,9 @@ def choose_scale(
     """The scale whose labels of half of the views reproduce the masks of the other half best: of the settings' own, and
     of smaller or larger ones while these are clearly better.
 
-    spacing: (n,) of the points. near: depth of the near plane. Only some views and points are asked (see settings), but
-    all points hide others. Does not depend on the order of views or points.
+    spacing: (n,) that points are drawn by. thickness: (n,) of their surfaces. near: depth of the near plane. Only some
+    views and points are asked (see settings), but all points hide others. Does not depend on the order of views or
+    points.
     """
     geometry = settings.geometry
     if len(geometry.scales) == 1:
@@ -79,7 +80,6 @@ def choose_scale(
     around = neighbourhood(points.xyz[sample], geometry)
     asked = np.zeros(len(points), np.bool_)
     asked[sample] = True
-    thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
     halves = chosen[0::2], chosen[1::2]
 
     def shown(scale: float) -> list[MaskTable]:

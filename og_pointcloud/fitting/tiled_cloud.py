@@ -112,7 +112,12 @@ class TiledCloud:
     @cached_property
     def spacing(self) -> NDArray[np.float32]:
         """(n,) float32, as `Neighbourhood.spacing`."""
-        return self.work.array("spacing", self.key, vanished)
+        return self.work.array("spacing", self.key, vanished)[0]
+
+    @cached_property
+    def drawn_spacing(self) -> NDArray[np.float32]:
+        """(n,) float32, as of `geometry.drawn_spacing`."""
+        return self.work.array("spacing", self.key, vanished)[1]
 
     def inner(self, tile: int) -> slice:
         """Which of a tile's members are its own points and not of its margin: these lie in one stretch."""

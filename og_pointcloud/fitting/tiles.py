@@ -43,9 +43,16 @@ from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
-from og_pointcloud.rendering.geometry import chance_of_place, isotropic, near_plane, neighbourhood, sample_of_points
+from og_pointcloud.rendering.geometry import (
+    chance_of_place,
+    drawn_spacing,
+    isotropic,
+    near_plane,
+    neighbourhood,
+    sample_of_points,
+)
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
-from og_pointcloud.rendering.surface import surface_thickness, with_distinct_points
+from og_pointcloud.rendering.surface import sight_thickness, surface_thickness, with_distinct_points
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
@@ -117,7 +124,8 @@ def fit_tiles(
         journal.notes["tiles"] = np.diff(cloud.tiles.start).tolist()
         journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in cloud.margins]
         spacing = partial(_spacing, cloud, settings)
-        work.array("spacing", cloud.key, lambda: np.concatenate(run(spacing, range(len(cloud.tiles)), "spacing")))
+        parts = range(len(cloud.tiles))
+        work.array("spacing", cloud.key, lambda: np.concatenate(run(spacing, parts, "spacing"), axis=1))
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
@@ -158,8 +166,9 @@ def _points_per_tile(points: int, left: int) -> int:
 
 
 def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
-    """(points of the tile,) their spacing."""
-    return cloud.neighbours(tile, settings.geometry).spacing[cloud.inner(tile)]
+    """(2, points of the tile) their spacing, and the one that they are drawn by."""
+    around, members = cloud.neighbours(tile, settings.geometry), cloud.members[tile]
+    return np.stack([around.spacing, drawn_spacing(cloud.points.xyz[members], around)])[:, cloud.inner(tile)]
 
 
 # Views ----------------------------------------------------------------------------------------------------------
@@ -181,7 +190,7 @@ class _Drawing:
         if self.scale is None or self.opacity is None:
             splats = Gaussians.from_points(chosen)
             return replace(splats, scale=splats.scale * larger[:, None])
-        return isotropic(chosen, cloud.spacing[rows] * larger, self.scale, self.opacity)
+        return isotropic(chosen, cloud.drawn_spacing[rows] * larger, self.scale, self.opacity)
 
 
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
@@ -191,12 +200,14 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
     if points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return _Drawing(None, None, near, typical)
-    few, spacing = points, cloud.spacing
+    few, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
     if len(points) > CHOICE_POINTS:
         journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
         few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
-        spacing = neighbourhood(few.xyz, geometry).spacing
-    choice = choose_scale(few, spacing, views, near, settings, journal)
+        around = neighbourhood(few.xyz, geometry)
+        spacing, drawn = around.spacing, drawn_spacing(few.xyz, around)
+    thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
+    choice = choose_scale(few, drawn, thickness, views, near, settings, journal)
     note_scale(choice, journal)
     return _Drawing(choice.scale, geometry.opacity, near, typical)
 
@@ -342,8 +353,8 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
     to fall to ALPHA_MIN. The projection is linearized within a margin of the image: there a round one is widened.
     """
-    points, spacing = cloud.points, cloud.spacing[part]
-    widest = spacing * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
+    points, spacing, drawn = cloud.points, cloud.spacing[part], cloud.drawn_spacing[part]
+    widest = drawn * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         uv_px, depth = camera.project(points.xyz[part])
         focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])

@@ -22,6 +22,13 @@ from og_pointcloud.settings import GeometrySettings
 
 TAMED_BY = 16
 """A point's spacing is at most the median spacing of this many neighbours."""
+SPARSE = 3.0
+"""A point whose spacing is more than so many times the scene's is a floater, if those about it are scattered."""
+SCATTERED = 0.1
+"""They are if more than this share of their spread lies across the plane that fits them best: of 1/3 in all directions
+alike. Of a surface it is less the sparser it is beside its noise."""
+FLOATER = 0.1
+"""Floaters are drawn so many typical spacings apart: they hide next to nothing."""
 ROWS_AT_ONCE = 1 << 18
 """Points whose neighbours are looked up at once: the look-up returns three times as many bytes as are kept."""
 
@@ -84,6 +91,23 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     # Where points are denser than is typical, they adjoin as far as elsewhere.
     adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
     return Neighbourhood(spacing, index, adjoining)
+
+
+def drawn_spacing(xyz: NDArray[np.float32], around: Neighbourhood) -> NDArray[np.float32]:
+    """(n,) float32, the spacing that points are drawn by: their own, and FLOATER of the typical one for floaters.
+
+    Points that lie far apart in all directions close no surface. Drawn as large as they are apart, a few hundred of
+    them would hide a room.
+    """
+    spacing, typical = around.spacing.copy(), float(np.median(around.spacing))
+    sparse = np.flatnonzero(spacing > SPARSE * typical)
+    for low in range(0, len(sparse), ROWS_AT_ONCE):
+        rows = sparse[low : low + ROWS_AT_ONCE]
+        near = xyz[around.index[rows]].astype(np.float64)
+        near -= near.mean(axis=1, keepdims=True)
+        spread = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
+        spacing[rows[spread[:, 0] > SCATTERED * spread.sum(axis=1)]] = FLOATER * typical
+    return spacing
 
 
 def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
