@@ -45,6 +45,8 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.colors.SURENESS_POWER": ("", ()),
     "fitting.held_out.CLEARLY": ("table", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
+    "rendering.geometry.SPARSE": ("table", ()),
+    "rendering.geometry.SCATTERED": ("table", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
@@ -69,8 +71,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
         "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
         "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "fitting.held_out.CLEARLY",
-        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX",
-        "rendering.sightings.RING_SHARE",
+        "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",
+        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
