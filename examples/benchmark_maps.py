@@ -34,7 +34,7 @@ from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.formats.capture import depth_files, read_capture, read_poses
 from og_pointcloud.formats.depth import DepthFrame, resampled
 from og_pointcloud.formats.fusion import fuse
-from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.formats.poses import in_local_frame, rotation_of_vector
 from og_pointcloud.mapping.sight import depth_views
 from og_pointcloud.scene import Camera, Points, Scene
 
@@ -92,12 +92,9 @@ def frames_of(folder: Path, options: argparse.Namespace) -> tuple[Scene, list[og
 
 
 def _moved(camera: Camera, random: np.random.Generator, metres: float, degrees: float) -> Camera:
-    axis = random.normal(size=3) * np.deg2rad(degrees) / np.sqrt(3)
-    x, y, z = axis
-    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    left, _, right = np.linalg.svd(turn)
+    turn = rotation_of_vector(random.normal(size=3) * np.deg2rad(degrees) / np.sqrt(3))
     pose = camera.world_to_camera.copy()
-    pose[:3] = (left @ right) @ pose[:3]
+    pose[:3] = turn @ pose[:3]
     pose[:3, 3] += random.normal(size=3) * metres / np.sqrt(3)
     return replace(camera, world_to_camera=pose)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from og_pointcloud_zoo.draws import draw, half_of, scene_names
+from og_pointcloud_zoo.draws import draw, is_chosen, scene_names
 from og_pointcloud_zoo.make import drawn_capture, made_scene
 from og_pointcloud_zoo.measure import answered
 from og_pointcloud_zoo.report import HALVES
@@ -75,13 +75,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/zoo"))
     parser.add_argument("--half", choices=tuple(HALVES))
-    parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help="scenes whose name begins so")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes whose name begins so")
     options = parser.parse_args(arguments)
     print(f"{'scene':<26}" + "".join(f"{kind:>18}" for kind in KINDS))
     rows = []
-    for name in scene_names():
-        if options.half not in (None, half_of(name)) or not name.startswith(tuple(options.only)):
-            continue
+    for name in (name for name in scene_names() if is_chosen(name, options.half, options.only)):
         folder = made_scene(draw(name), options.output / "scenes")
         scene, truth, tracks = og.read_capture(folder), read_truth(folder), true_tracks(name)
         row = []

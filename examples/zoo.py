@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from og_pointcloud_zoo.constants import constants, page, tried
-from og_pointcloud_zoo.draws import draw, half_of, scene_names
+from og_pointcloud_zoo.draws import draw, is_chosen, scene_names
 from og_pointcloud_zoo.make import made_scene
 from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings
 from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
@@ -45,13 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.constants:
         _write_constants(options)
         return
-    chosen = [*options.captures, *(Path(name) for name in scene_names())]
-    chosen = [
-        path
-        for path in chosen
-        if options.half in (None, half_of(path.name))
-        and (not options.only or any(path.name.startswith(name) for name in options.only))
-    ]
+    paths = [*options.captures, *map(Path, scene_names())]
+    chosen = [path for path in paths if is_chosen(path.name, options.half, options.only)]
     if not chosen:
         parser.error(f"no scene begins with {', '.join(options.only)}; expected one of {', '.join(scene_names())}")
     if options.list:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -191,3 +191,8 @@ def half_of(name: str) -> str:
     digits = re.findall(r"\d", name)
     even = bool(digits) and int(digits[-1]) % 2 == 0
     return "choose" if even or name in SETTLED else "judge"
+
+
+def is_chosen(name: str, half: str | None, beginnings: Sequence[str]) -> bool:
+    """Whether a scene is of a half, None for both, and its name begins in one of these ways; without any, in any."""
+    return half in (None, half_of(name)) and name.startswith(tuple(beginnings) or "")
