@@ -40,7 +40,7 @@ class LeftOut(Enum):
     RENDERING = "rendering", "rendering of {count} views", "an interrupted fit kept them in '{folder}'"
     VIEWS = (
         "views", "{count} of {total} views",
-        "nearly all that each of them shows is shown by {enough} of the others",
+        "nearly all that each of them and its masks show is shown by {enough} of the others",
     )
     FINE_POINTS = (
         "points finer than pixels", "{share:.0%} of the points in the images",

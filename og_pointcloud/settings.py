@@ -77,7 +77,8 @@ class GeometrySettings(_Checked):
     sight_thickness: float = 3.0
     """Points closer than this many spacings along a ray are of one surface and do not hide each other."""
     enough_views: int = 24
-    """Views that see a point; further ones are left out where all that they see is seen by so many (coverage.py)."""
+    """Views that see a point; further ones are left out where what they and their masks show is shown by so many others
+    (coverage.py)."""
     neighbours: int = 24
     """Nearest points of each point among which its neighbours are looked for."""
     reach: float = 3.0

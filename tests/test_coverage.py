@@ -11,7 +11,15 @@ from scenes import camera, room_poses, sample_surfaces
 
 import og_pointcloud as og
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.coverage import BEHIND, CELL_POINTS, FEW, needed_views, seen_points, with_needed_views
+from og_pointcloud.rendering.coverage import (
+    BEHIND,
+    CELL_POINTS,
+    FEW,
+    masks_at,
+    needed_views,
+    seen_points,
+    with_needed_views,
+)
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -48,25 +56,56 @@ def test_no_view_sees_what_lies_behind_a_wall() -> None:
     assert not seen[len(wall) :].any()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(6))
 def test_needed_views_are_found_one_after_the_other(seed: int) -> None:
     random, enough = np.random.default_rng(seed), 3
     seen = random.random((12, 80)) < random.uniform(0.2, 0.9, (12, 1))
+    mask = np.where(seen & (random.random(seen.shape) < 0.7), random.integers(0, 4, seen.shape), -1).astype(np.int32)
     order, stay = random.permutation(12), set(range(12))
     for view in order:
-        others = seen[sorted(stay - {view})].sum(axis=0)
-        if sum(others[g] < enough for g in np.flatnonzero(seen[view])) < FEW * seen[view].sum():
+        others = sorted(stay - {view})
+        few = [g for g in np.flatnonzero(seen[view]) if seen[others, g].sum() < enough]
+        rare = [g for g in range(80) if (mask[others, g] >= 0).sum() < enough]
+        shows = [np.flatnonzero(mask[view] == one) for one in range(4)]
+        most = any(np.isin(points, rare).sum() > len(points) / 2 for points in shows)
+        if len(few) < FEW * seen[view].sum() and not most:
             stay.remove(view)
     assert 3 <= len(stay) < 12
-    np.testing.assert_array_equal(np.flatnonzero(needed_views(seen, order, enough)), sorted(stay))
+    np.testing.assert_array_equal(np.flatnonzero(needed_views(seen, mask, order, enough)), sorted(stay))
 
 
 def test_views_that_alone_see_a_thing_stay_and_so_do_those_that_see_nothing_of_the_sample() -> None:
     seen = np.zeros((12, 100), np.bool_)
     seen[:10, :90], seen[10, 50:] = True, True
-    needed = needed_views(seen, np.arange(12), 4)
+    needed = needed_views(seen, np.where(seen, 0, -1).astype(np.int32), np.arange(12), 4)
     assert needed[10:].all()
     assert needed[:10].sum() == 4
+
+
+def test_the_few_views_that_have_a_mask_of_a_thing_stay() -> None:
+    """Those that would be left out if they had none."""
+    scene = balls(40)
+    none = np.full((scene.views[0].camera.height, scene.views[0].camera.width), -1, np.int32)
+    bare = [replace(view, masks=none, mask_features=np.ones((0, 4), np.float32)) for view in scene.views]
+    stay = {view.name for view in with_needed_views(replace(scene, views=tuple(bare)), 4, Journal(False)).views}
+    rare = [k for k, view in enumerate(bare) if view.name not in stay][:3]
+    assert rare
+    views = tuple(scene.views[k] if k in rare else view for k, view in enumerate(bare))
+    few = with_needed_views(replace(scene, views=views), 4, Journal(False))
+    assert len(few.views) < 40
+    assert {f"view{k}" for k in rare} <= {view.name for view in few.views}
+
+
+def test_masks_are_looked_up_where_points_are_seen() -> None:
+    scene = balls(5)
+    masks = np.arange(scene.views[0].mask_map().size, dtype=np.int32).reshape(scene.views[0].mask_map().shape)
+    views = [replace(view, masks=masks, mask_features=np.ones((masks.size, 4), np.float32)) for view in scene.views]
+    seen = seen_points(scene.points.xyz, [view.camera for view in views])
+    found = masks_at(scene.points.xyz, seen, views)
+    assert (found[~seen] == -1).all()
+    for view, row, shown in zip(views, found, seen, strict=True):
+        column, line = np.floor(view.camera.project(scene.points.xyz[shown])[0]).astype(int).T
+        np.testing.assert_array_equal(row[shown], masks[line, column])
 
 
 def balls(count: int) -> Scene:

@@ -2,23 +2,25 @@
 
 A wide lens shows the whole room from each place, a video shows it again with every frame. Of a sample of the points it
 is asked which ones each view sees: those in its image that do not lie behind others. Then views are left out one after
-the other, as long as nearly all that each of them sees is seen by enough of the views that stay.
+the other, as long as nearly all that each of them sees is seen by enough of the views that stay, and most of what each
+of its masks shows is in masks of as many: a thing that few views have a mask of loses none of these.
 """
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.kernels import njit, prange
+from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.geometry import sample_of_points
 from og_pointcloud.rendering.splatting import seen_from
-from og_pointcloud.scene import Camera, Scene
+from og_pointcloud.scene import Camera, Scene, View
 
 SAMPLE = 8000
 """Points that stand for all."""
@@ -32,25 +34,49 @@ BEHIND = 1.3
 
 def with_needed_views(scene: Scene, enough: int, journal: Journal) -> Scene:
     """The scene without views that it does not need; which ones, their names decide, not their order."""
-    chance = [zlib.crc32(view.name.encode()) for view in scene.views]
+    order = np.argsort([zlib.crc32(view.name.encode()) for view in scene.views])
     xyz = scene.points.xyz[sample_of_points(scene.points.xyz, SAMPLE)]
-    needed = needed_views(seen_points(xyz, [view.camera for view in scene.views]), np.argsort(chance), enough)
+    seen = seen_points(xyz, [view.camera for view in scene.views])
+    # Masks are read only where the cameras alone leave a choice.
+    if needed_views(seen, np.full(seen.shape, -1, np.int32), order, enough).all():
+        return scene
+    needed = needed_views(seen, masks_at(xyz, seen, scene.views), order, enough)
     if needed.all():
         return scene
     journal.leave_out(LeftOut.VIEWS, count=int((~needed).sum()), total=len(needed), enough=enough)
     return replace(scene, views=tuple(view for view, stays in zip(scene.views, needed, strict=True) if stays))
 
 
-def needed_views(seen: NDArray[np.bool_], order: NDArray[np.integer], enough: int) -> NDArray[np.bool_]:
-    """(views,) bool, False for views that may be left out together. seen: (views, points). order: in which views are
-    asked whether they may."""
-    needed, count = np.ones(len(seen), np.bool_), seen.sum(axis=0)
+def needed_views(
+    seen: NDArray[np.bool_], mask: NDArray[np.int32], order: NDArray[np.integer], enough: int
+) -> NDArray[np.bool_]:
+    """(views,) bool, False for views that may be left out together. seen: (views, points). mask: (views, points) int32,
+    the mask that each point is seen in, -1 none. order: in which views are asked whether they may."""
+    needed, count, masked = np.ones(len(seen), np.bool_), seen.sum(axis=0), (mask >= 0).sum(axis=0)
     for view in order:
-        points = seen[view]
-        if np.count_nonzero(count[points] <= enough) < FEW * np.count_nonzero(points):
+        points = np.flatnonzero(seen[view])
+        inside = points[mask[view, points] >= 0]
+        rare = np.bincount(mask[view, inside], np.where(masked[inside] <= enough, 1, -1))
+        if np.count_nonzero(count[points] <= enough) < FEW * len(points) and (rare <= 0).all():
             needed[view] = False
-            count -= points
+            count[points] -= 1
+            masked[inside] -= 1
     return needed
+
+
+def masks_at(xyz: NDArray[np.float32], seen: NDArray[np.bool_], views: Sequence[View]) -> NDArray[np.int32]:
+    """(views, n) int32, the mask that each point (n, 3) is seen in, -1 where it is in none or not seen."""
+    found = np.full(seen.shape, -1, np.int32)
+
+    def look(row: int) -> None:
+        points = np.flatnonzero(seen[row])
+        masks, (uv_px, _) = views[row].mask_map(), views[row].camera.project(xyz[points])
+        column, line = np.clip(uv_px.astype(np.intp), 0, np.array(masks.shape[::-1]) - 1).T
+        found[row, points] = np.maximum(masks[line, column], -1)
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        list(pool.map(look, np.flatnonzero(seen.any(axis=1))))
+    return found
 
 
 def seen_points(xyz: NDArray[np.float32], cameras: Sequence[Camera]) -> NDArray[np.bool_]:
