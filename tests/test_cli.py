@@ -131,22 +131,29 @@ def test_a_cut_image_is_one_line(tiny_capture):
     assert len(found.stderr.splitlines()) == 1, found.stderr
 
 
-def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys):
+def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys, monkeypatch):
     capture, scene = fitted
+    monkeypatch.chdir(tmp_path)
     bundle = shutil.copy(scene, tmp_path / "it's.ogpc")
     words, cloud = ("--text-features", capture.text_features), capture.folder / "points.ply"
+    others = {**np.load(capture.text_features), "names": ["rouge", "bleu", "lampe"]}
+    np.savez(tmp_path / "others.npz", **others)
+    others = ("--text-features", tmp_path / "others.npz")
     assert run(capsys, "index", tmp_path, "-o", tmp_path / "atlas")[0] == 0
     for command in (
         ("segment", bundle, *words, "--points", cloud),
         ("segment", bundle, *words, "--labels", "red ball, blue ball", "--points", cloud, "-o", tmp_path / "a.ply"),
         ("view", bundle, *words, "--html", tmp_path / "a.html"),
         ("edit", "extract", bundle, "--word", "red ball", *words, "--cloud", cloud, "-o", tmp_path / "b.ply"),
+        ("select", bundle, "rouge", *others),
+        ("instances", bundle, *others),
         ("instances", bundle, "-o", tmp_path / "a.csv"),
         ("find", tmp_path / "atlas", "red ball", "--html", tmp_path / "found.html"),
     ):
         stdout = output_of(capsys, *command)
         *_, last = stdout.splitlines()
         assert last.startswith("next: "), command
+        assert ("--text-features" in last) == ("--text-features" in command)
         assert run(capsys, *shlex.split(last[last.index("og-pointcloud ") :])[1:])[0] == 0, last
         if command[0] != "view":
             assert "next: " not in run(capsys, *command, "--json")[1]

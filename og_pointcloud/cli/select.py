@@ -8,25 +8,27 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_option, add_shared, calibration_hint, names_in, print_json, print_next
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--text-features", "--json")
-    add_option(parser, "text", "WORD", "a word or phrase")
-    add_option(parser, "--against", "A,B,C", "words that compete with it (default: all that are known)")
+    common.add_shared(parser, "bundle", "--text-features", "--json")
+    common.add_option(parser, "text", "WORD", "a word or phrase")
+    common.add_option(parser, "--against", "A,B,C", "words that compete with it (default: all that are known)")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    against = names_in(arguments.against)
+    against = common.names_in(arguments.against)
     selection = og.select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)
     if arguments.json:
-        print_json(selection.to_json())
+        common.print_json(selection.to_json())
         return
     print(selection)
     if selection.unknown:
         print(f"{selection.unknown} instances have no feature that a word could be compared with")
     if not selection.calibrated:
-        print(f"not calibrated: scores are cosines. {calibration_hint(arguments.bundle)}")
+        print(f"not calibrated: scores are cosines. {common.calibration_hint(arguments.bundle)}")
     if selection.fitting:
-        print_next("edit", "extract", arguments.bundle, "--word", arguments.text, "-o", "selected.ply")
+        given = common.as_given(arguments, "--text-features")
+        common.print_next("edit", "extract", arguments.bundle, "--word", arguments.text, *given, "-o", "selected.ply")
