@@ -10,17 +10,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import (
-    Parser,
-    add_command,
-    add_option,
-    add_output,
-    add_shared,
-    as_given,
-    numbers,
-    print_next,
-    print_result,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -39,38 +30,38 @@ def add(parser: Parser) -> None:
     for name, summary in SUMMARIES.items():
         color = " --color 40,70,220" if name == "recolour" else ""
         example = f'og-pointcloud edit {name} kitchen.ogpc --word "red mug"{color} --cloud kitchen.ply -o edited.ply'
-        operation = add_command(operations, name, run, f"{summary}\n\n{example}")
-        add_shared(operation, "bundle", "--text-features", "--cloud", "--json")
+        operation = common.add_command(operations, name, run, f"{summary}\n\n{example}")
+        common.add_shared(operation, "bundle", "--text-features", "--cloud", "--json")
         what = operation.add_mutually_exclusive_group(required=True)
-        add_option(what, "--word", "WORD", "every instance that it fits better than other words do")
-        add_option(what, "--id", "K,L", "instances by their ids (`og-pointcloud instances` lists them)")
-        add_option(what, "--xyz", "X,Y,Z", "the instance at a place in world coordinates")
+        common.add_option(what, "--word", "WORD", "every instance that it fits better than other words do")
+        common.add_option(what, "--id", "K,L", "instances by their ids (`og-pointcloud instances` lists them)")
+        common.add_option(what, "--xyz", "X,Y,Z", "the instance at a place in world coordinates")
         near = "also unlabelled points so near, in spacings (default: 0)"
-        add_option(operation, "--halo", "N", near, type=float, default=0.0)
+        common.add_option(operation, "--halo", "N", near, type=float, default=0.0)
         endings, help = (".ply", ".spz"), "the edited cloud; .spz of splats"
-        add_output(operation, "-o", "--output", endings=endings, required=True, help=help)
-    add_option(operations.choices["recolour"], "--color", "R,G,B", "0 to 255 each", required=True)
+        common.add_output(operation, "-o", "--output", endings=endings, required=True, help=help)
+    common.add_option(operations.choices["recolour"], "--color", "R,G,B", "0 to 255 each", required=True)
 
 
 def run(arguments: argparse.Namespace) -> None:
     scene = og.load(arguments.bundle)
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
     if arguments.operation == "recolour":
-        options["color"] = numbers(arguments.color, "--color", 3)
+        options["color"] = common.numbers(arguments.color, "--color", 3)
     done = getattr(og.edit, arguments.operation)(scene, what_to_edit(arguments), arguments.output, **options)
     record: dict[str, Any] = {"output": str(done.path), "operation": arguments.operation, "points": done.points}
     record |= {"changed": done.changed, "instances": list(done.instances), "notes": list(done.notes)}
-    print_result(arguments, record, print_edit)
+    common.print_result(arguments, record, print_edit)
     if not arguments.json:
-        given = as_given(arguments, "--text-features")
-        print_next("view", arguments.bundle, "--cloud", done.path, *given, "--html", done.path.with_suffix(".html"))
+        given = [*common.as_given(arguments, "--text-features"), "--html", done.path.with_suffix(".html")]
+        common.print_next("view", arguments.bundle, "--cloud", done.path, *given)
 
 
 def what_to_edit(arguments: argparse.Namespace) -> What:
     if arguments.word is not None:
         return arguments.word
     if arguments.xyz is not None:
-        return og.pick(arguments.bundle, numbers(arguments.xyz, "--xyz", 3))
+        return og.pick(arguments.bundle, common.numbers(arguments.xyz, "--xyz", 3))
     try:
         return [int(part) for part in arguments.id.split(",")]
     except ValueError:

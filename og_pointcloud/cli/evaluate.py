@@ -12,15 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_commands,
-    add_option,
-    add_output,
-    names_in,
-    print_table,
-    replaceable,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import write_json
 
@@ -38,8 +31,8 @@ TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 
 
 def add(parser: Parser) -> None:
-    add_path = partial(add_option, type=replaceable)
-    capture, scannet, lerf = add_commands(parser, "protocol", run_capture, run_scannet, run_lerf)
+    add_path = partial(common.add_option, type=common.replaceable)
+    capture, scannet, lerf = common.add_commands(parser, "protocol", run_capture, run_scannet, run_lerf)
     add_path(capture, "capture", "CAPTURE", "folder with gt.npz")
     add_path(capture, "bundle", "S.ogpc", "what `fit` wrote of it")
     add_path(capture, "--against", "OTHER.ogpc", "another: also the difference, less OTHER, paired")
@@ -50,10 +43,10 @@ def add(parser: Parser) -> None:
     add_path(lerf, "--gaussians", "G", splats, required=True)
     for data_set in (scannet, lerf):
         add_path(data_set, "--predictions", "P", "folder with <scene>.ogpc", required=True)
-        add_option(data_set, "--scenes", "A,B", "these scenes (default: all with labels in DIR)")
+        common.add_option(data_set, "--scenes", "A,B", "these scenes (default: all with labels in DIR)")
     for protocol in (capture, scannet, lerf):
         add_path(protocol, "--text-features", "F.npz", "words with vectors (default: the capture's, the scene's)")
-        add_output(protocol, "--json", endings=(".json",), help="also write every score")
+        common.add_output(protocol, "--json", endings=(".json",), help="also write every score")
 
 
 # Captures -------------------------------------------------------------------------------------------------------
@@ -74,7 +67,7 @@ def run_capture(arguments: argparse.Namespace) -> None:
     change = difference(answer, ask(arguments.against, truth, words), truth) if arguments.against else None
     name, interval = arguments.capture.resolve().name, score.interval
     row = {"": name} | capture_cells(score) | ({"less the other": signed(change)} if change else {})
-    print_table(tuple(row), [tuple(row.values())])
+    common.print_table(tuple(row), [tuple(row.values())])
     print(
         "unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of the scene, not over points: "
         f"{interval.blocks} cubes of {interval.edge / answer.spacing:.0f} point spacings"
@@ -108,7 +101,7 @@ def run_scannet(arguments: argparse.Namespace) -> None:
     """
     from og_pointcloud.evaluate.scannet import SCENES, TASKS, ask, read_truth, score_scene
 
-    truths = scannet_truths(arguments.folder, names_in(arguments.scenes))
+    truths = scannet_truths(arguments.folder, common.names_in(arguments.scenes))
     files = {scene: prediction_file(arguments.predictions, scene) for scene in truths}
     scores: dict[int, dict[str, dict[str, Any]]] = {task: {} for task in TASKS}
     for scene, file in truths.items():
@@ -122,7 +115,7 @@ def run_scannet(arguments: argparse.Namespace) -> None:
         (f"{task} classes", *(percent(mean[name]) for name in TASK_MEANS), spread(mean["interval"]))
         for task, mean in means.items()
     ]
-    print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
+    common.print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
     published = sum(scene in SCENES for scene in truths)
     print(f"{len(truths)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
     if arguments.gaussians is None:
@@ -189,7 +182,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
     from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, scene_names, score_pairs
 
     # Everything is looked up before anything is rendered, so that what the last scene lacks is named at once.
-    wanted = known_scenes(arguments.folder, scene_names(arguments.folder), names_in(arguments.scenes))
+    wanted = known_scenes(arguments.folder, scene_names(arguments.folder), common.names_in(arguments.scenes))
     labels = [read_scene(arguments.folder, name) for name in wanted]
     files = [prediction_file(arguments.predictions, name) for name in wanted]
     splats = [gaussians_file(arguments.gaussians, name) for name in wanted]
@@ -222,7 +215,7 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     pooled = [np.concatenate(list(of_way.values())) for of_way in ious.values()]
     intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
     rows.append(("95 % over pairs", "", *(spread((found.low, found.high)) for found in intervals)))
-    print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
+    common.print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
     print(f"{total} pairs of {len(scenes)} scenes; the published table has {PUBLISHED_PAIRS} of 4")
     return {way: {"miou": miou, "accuracy": found} for way, (miou, found) in means.items()}
 

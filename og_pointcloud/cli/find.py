@@ -11,18 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_option,
-    add_output,
-    add_shared,
-    as_given,
-    check_at_least,
-    numbers,
-    print_json,
-    print_next,
-    print_table,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import coordinate, printable
 
 if TYPE_CHECKING:
@@ -30,23 +20,23 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    option = partial(add_option, parser)
+    option = partial(common.add_option, parser)
     option("atlas", "ATLAS", "what `index` wrote", type=Path)
     option("words", "WORD", "words or phrases", nargs="+")
     option("--within", "X,Y,Z,X,Y,Z", "two corners of a box, the low one first: things with their middle in it")
     option("--scene", "NAME", "ask only this one, or those of a pattern: 'site3/*'; repeatable", action="append")
     option("--top", "N", "how many (default: %(default)s)", type=int, default=20)
     option("--lance", "URI", "search what `index --lance` wrote, not memory")
-    add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
-    add_shared(parser, "--text-features", "--json")
+    common.add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
+    common.add_shared(parser, "--text-features", "--json")
 
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.collection.collection import Collection
     from og_pointcloud.show.findings_page import write_findings
 
-    check_at_least("--top", arguments.top, 1)
-    corners = None if arguments.within is None else numbers(arguments.within, "--within", 6)
+    common.check_at_least("--top", arguments.top, 1)
+    corners = None if arguments.within is None else common.numbers(arguments.within, "--within", 6)
     collection = Collection(arguments.atlas, lance=arguments.lance)
     findings = collection.find(
         arguments.words,
@@ -60,10 +50,10 @@ def run(arguments: argparse.Namespace) -> None:
     for note in findings.not_asked:
         print(f"warning: {printable(note)}", file=sys.stderr)
     if arguments.json:
-        print_json(findings.to_json())
+        common.print_json(findings.to_json())
         return
     if findings:
-        print_table(("scene", "instance", "word", "score", "center", "size"), [cells(finding) for finding in findings])
+        common.print_table(("scene", "instance", "word", "score", "center", "size"), list(map(cells, findings)))
         if not any(finding.fits for finding in findings):
             print("nothing fits what was asked: no score is above one half")
     else:
@@ -73,8 +63,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.html:
         print(f"wrote {arguments.html}")
     if findings:
-        best, given = findings[0], as_given(arguments, "--text-features")
-        print_next("view", collection.file(best.scene), "--labels", best.word, *given)
+        best, given = findings[0], common.as_given(arguments, "--text-features")
+        common.print_next("view", collection.file(best.scene), "--labels", best.word, *given)
 
 
 def cells(finding: Finding) -> tuple[str, ...]:

@@ -8,26 +8,18 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import (
-    Parser,
-    add_option,
-    add_output,
-    add_shared,
-    as_given,
-    direction,
-    names_in,
-    print_next,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.journal import Journal
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--labels", "--text-features", "--cloud", "--up")
-    add_output(parser, "--html", endings=(".html", ".htm"), help="the page to write (default: S.html)")
+    common.add_shared(parser, "bundle", "--labels", "--text-features", "--cloud", "--up")
+    common.add_output(parser, "--html", endings=(".html", ".htm"), help="the page to write (default: S.html)")
     parser.add_argument("--boxes", action="store_true", help="boxes around what has a label")
     cut = "hide this share of the height, from the top (default: 0)"
-    add_option(parser, "--cut", "SHARE", cut, type=float, default=0.0)
+    common.add_option(parser, "--cut", "SHARE", cut, type=float, default=0.0)
     parser.add_argument("--instances", action="store_true", help="colors by instance")
 
 
@@ -45,11 +37,11 @@ def run(arguments: argparse.Namespace) -> None:
         scene = og.load(arguments.bundle)
         other = og.read_points(arguments.cloud) if arguments.cloud else None
     with journal.stage("segment"):
-        asked, labels = scene if other is None else other.xyz_world, names_in(arguments.labels)
+        asked, labels = scene if other is None else other.xyz_world, common.names_in(arguments.labels)
         words = scene.known_words(labels, arguments.text_features) if arguments.instances else labels
         result = og.segment(asked, words, scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
-    up = np.array(direction(arguments.up or "z"), np.float64)
+    up = np.array(common.direction(arguments.up or "z"), np.float64)
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no point to show; expected at least one")
@@ -62,5 +54,5 @@ def run(arguments: argparse.Namespace) -> None:
     if left_out := write_page(page, scene, result, view, look, rgb):
         print(f"left out of the page: {left_out}")
     print_segmentation(describe_segmentation(result, journal, arguments.bundle, page))
-    given = as_given(arguments, "--text-features", "--up")
-    print_next("instances", arguments.bundle, *given, hint="what each instance is, and where: ")
+    given = common.as_given(arguments, "--text-features", "--up")
+    common.print_next("instances", arguments.bundle, *given, hint="what each instance is, and where: ")
