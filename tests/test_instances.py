@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import error_of
-from labelled_clouds import WIDTH, WORDS, instance_table, make_cloud, room, unit_rows
+from labelled_clouds import WIDTH, WORDS, instance_table, make_cloud, room, tough_clouds, unit_rows
 
 import og_pointcloud as og
 from og_pointcloud.ask.boxes import axis_aligned_box, oriented_box
@@ -26,6 +26,13 @@ def scene():
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory):
     return og.write_bundle(room(600), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+@pytest.mark.parametrize("cloud", tough_clouds().values(), ids=tough_clouds())
+def test_every_cloud_has_a_table(cloud):
+    table = og.instance_table(LabelledScene.from_cloud(cloud))
+    assert str(table).startswith(f"{len(cloud.instances)} instances")
+    assert json.loads(table.to_json(), parse_constant=pytest.fail) == table.to_records(), "no NaN, no infinity"
 
 
 def test_each_column_is_what_it_says(scene):

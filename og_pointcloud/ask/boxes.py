@@ -19,9 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.poses import LARGEST, quaternion_of, upright_axes
+from og_pointcloud.formats.poses import quaternion_of, upright_axes
 from og_pointcloud.scene import DoubleArray
 
+LARGEST = 1e100
+"""Volumes of boxes at larger coordinates would be no numbers."""
 DIRECTIONS = 180
 """Directions around a circle along which the extreme points are taken as the corners of an outline."""
 PRODUCTS_AT_ONCE = 1 << 20
