@@ -140,7 +140,6 @@ def test_a_second_run_gives_the_same_bits(known: Known, labelled: LabelledCloud)
 def test_order_of_points_does_not_matter(known: Known, labelled: LabelledCloud) -> None:
     order = np.random.default_rng(0).permutation(len(known.truth))
     points = known.scene.points
-    assert points.rgb is not None
     shuffled = replace(points, xyz=points.xyz[order], rgb=points.rgb[order])
     ids = fit(replace(known.scene, points=shuffled), progress=False).instance_ids
     assert share_alike(ids, labelled.instance_ids[order]) > 0.998

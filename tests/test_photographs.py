@@ -110,7 +110,6 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
     np.testing.assert_allclose(
         joined.outside.toarray(), [dense[1][part].sum(axis=0) for part in photographs], rtol=1e-6
     )
-    assert joined.through is not None
     np.testing.assert_allclose(
         joined.through.toarray(), [dense[3][part].sum(axis=0) for part in photographs], rtol=1e-6
     )
