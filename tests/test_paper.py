@@ -268,7 +268,7 @@ def test_a_codebook_step_moves_features_by_the_gradient_of_their_centers(balls: 
     moved = training.features.numpy() - features
     np.testing.assert_allclose(moved[clear], -settings.coarse_rate * np.sign(gradient)[clear], atol=1e-7)
     assert history.loss[0] == pytest.approx(np.abs(image).mean(), rel=1e-5)
-    assert clear.mean() > 0.9
+    assert clear.mean() > 0.8
 
 
 def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls, monkeypatch: pytest.MonkeyPatch) -> None:
