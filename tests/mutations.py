@@ -56,7 +56,7 @@ MUTATIONS = (
     ),
     Mutation(
         "labels judged by the views that they were made from", "fitting/held_out.py",
-        "shown[1 - half]", "shown[half]", ("test_held_out.py",),
+        "judge[1 - half]", "judge[half]", ("test_held_out.py",),
     ),
     # Scene, frames.
     Mutation(
