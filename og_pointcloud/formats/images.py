@@ -103,15 +103,23 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
     No pixel is decoded. SceneError, which begins with ``name``, beyond MAX_PIXELS.
     """
     pillow = require_pillow()
-    try:
-        with pillow.open(stream, formats=("PNG", "JPEG", "BMP", "WEBP", "TIFF")) as image:
-            width, height = image.size
-    except pillow.DecompressionBombError as error:  # beyond a bound of Pillow's own
-        raise SceneError(f"{name}: {error}; expected at most {MAX_PIXELS} pixels: scale it down") from None
-    except Exception:  # of many kinds, whatever a damaged header leads its readers to
-        return None
-    _check_pixels(name, width, height)
-    return width, height
+    from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+
+    kinds = (
+        PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
+        WebPImagePlugin.WebPImageFile, TiffImagePlugin.TiffImageFile,
+    )  # fmt: skip
+    for kind in kinds:  # and not Image.open, which warns of images from two thirds of MAX_PIXELS on
+        stream.seek(0)
+        try:
+            width, height = kind(stream).size
+        except pillow.DecompressionBombError as error:  # which WebP's reader raises by itself
+            raise SceneError(f"{name}: {error}; expected at most {MAX_PIXELS} pixels: scale it down") from None
+        except Exception:  # of many kinds, whatever another or a damaged header leads a reader to
+            continue
+        _check_pixels(name, width, height)
+        return width, height
+    return None
 
 
 def decoded(file: Path, flags: int) -> NDArray[np.generic]:
