@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pinhole
 import pytest
 from labelled_clouds import WORDS, make_cloud, queries, room, unit_rows
 
@@ -19,13 +20,7 @@ from og_pointcloud.scene import Camera
 
 def looking(position, target, width=40, height=30, focal=30.0):
     """A camera in world coordinates at ``position`` whose image centre shows ``target``; world z is up."""
-    position = np.asarray(position, float)
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
+    pose = pinhole.looking(position, np.subtract(target, position))
     return Camera(width, height, focal, 1.1 * focal, width / 2 + 0.3, height / 2 - 0.2, pose)
 
 
