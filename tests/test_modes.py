@@ -14,6 +14,7 @@ from test_fit import BOXES, boxes_on_a_table
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.fitting import labellers
 from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.labellers import LABELLERS, fast
 from og_pointcloud.fitting.learned.codebook import Codebook
 from og_pointcloud.journal import Journal, LeftOut, left_out_entry
@@ -117,10 +118,11 @@ def test_leaves_are_decided_on_largest_first_whatever_their_numbers(monkeypatch:
     found = [fast(prepared.table, prepared.surface, settings, Journal(False)) for _ in range(3)]
     for groups, book in zip(given, books, strict=True):
         np.testing.assert_array_equal(groups, given[0])
-        points = np.sort(np.bincount(book.leaf[book.leaf >= 0]))[::-1]
-        covered = [(prepared.table.weights[groups == group].sum(axis=0) > 0).sum() for group in range(len(points))]
+        # The leaf that masks of each group show most of.
+        points, in_leaf = np.bincount(book.leaf[book.leaf >= 0]), indicator(book.leaf, len(book.leaf_coarse))
+        shown = [(prepared.table.weights[groups == group] @ in_leaf.T).sum(axis=0) for group in range(len(points))]
         assert len(np.unique(points)) == len(points) > 2
-        assert (np.diff(covered) < 0).all()
+        assert (np.diff(points[np.argmax(shown, axis=1)]) < 0).all()
     for each in found:
         np.testing.assert_array_equal(each.instance_ids, found[0].instance_ids)
 
