@@ -3,7 +3,8 @@
 A wide lens shows the whole room from each place, a video shows it again with every frame. Of a sample of the points it
 is asked which ones each view sees: those in its image that do not lie behind others. Then views are left out one after
 the other, as long as nearly all that each of them sees is seen by enough of the views that stay, and most of what each
-of its masks shows is in masks of as many: a thing that few views have a mask of loses none of these.
+of its masks shows is in masks, of whatever, of as many: what few views have any mask of loses none of these. Not asked
+about are masks without a point of the sample, and which thing the others' masks show.
 """
 
 from __future__ import annotations
