@@ -1,6 +1,7 @@
 """Captures of fisheyes and panoramas: images become pinhole views, and their masks go with them."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from scenes import write_image
 import og_pointcloud as og
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import mask_table
+from og_pointcloud.formats import capture
 from og_pointcloud.formats.capture import read_capture, read_poses
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
@@ -102,6 +104,17 @@ def test_a_mask_across_a_border_of_faces_is_one_mask_of_each(panoramas):
     front, right = views["pano_0/front"], views["pano_0/right"]
     both = {int(row) for row in front.mask_features.argmax(1)} & {int(row) for row in right.mask_features.argmax(1)}
     assert both == {1}, "the ball at 48 degrees lies in both"
+
+
+def test_the_masks_of_an_image_are_read_once_for_all_its_faces(panoramas, monkeypatch):
+    monkeypatch.setattr(capture, "DECODED", 1)
+    scene = read_capture(panoramas)
+    maps = [view.mask_map() for view in scene.views]
+    shutil.rmtree(panoramas / "masks")
+    for view, ids in zip(scene.views, maps, strict=True):
+        again = view.mask_map()
+        assert again.dtype == np.int32
+        np.testing.assert_array_equal(again, ids)
 
 
 def test_photographs_are_split_like_their_masks(panoramas):

@@ -266,17 +266,22 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     size = scaled.camera.width, scaled.camera.height
     if not face.name:  # the one view of an image shows all of its masks
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
-    # Which masks a face shows decides its features: the map is read now, and once more when it is asked for.
+    # Which masks a face shows decides its features: the map is read now, and kept as runs of equal ids. These are
+    # smaller than the features of most masks, and the whole image is not read again for each of its faces.
     ids = scaled.mask_ids(layer.read())
-    if (last := ids.max(initial=-1)) >= len(layer.features):
+    flat, shape = ids.ravel(), ids.shape
+    first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
+    values, lengths = flat[first], np.diff(first, append=flat.size)
+    if (last := values.max()) >= len(layer.features):
         raise SceneError(
             f"view '{view}': mask id {last + 1} has no feature row (the features file has {len(layer.features)}): "
             "write one feature row per mask id"
         )
-    used, row_of_id = rows_shown(ids, len(layer.features))
+    used, row_of_id = rows_shown(values, len(layer.features))
+    rows = row_of_id[values]
     tracks = None if layer.tracks is None else layer.tracks[used]
     cut = CutMasks(posixpath.dirname(view), used)
-    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks, cut)
+    return MaskLayer(size, layer.features[used], lambda: np.repeat(rows, lengths).reshape(shape), tracks, cut)
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
