@@ -25,7 +25,7 @@ import og_pointcloud as og
 from og_pointcloud.ask.labelled_scene import load
 from og_pointcloud.ask.segmentation import SAVED_AS
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.cli import build_parser, main
+from og_pointcloud.cli import build_parser, common, main
 from og_pointcloud.cli import segment as cli_segment
 from og_pointcloud.formats.capture import read_capture
 
@@ -222,6 +222,13 @@ def test_output_below_a_file_is_refused(tiny_capture, capsys):
     assert "is not a folder that can be written to" in error_of(capsys, "fit", tiny_capture.folder, "-o", below_file)
 
 
+def test_a_demo_below_a_file_is_refused_before_its_room_is_made(tmp_path, monkeypatch, capsys):
+    demo = pytest.importorskip("og_pointcloud_room.demo")
+    monkeypatch.setattr(demo, "make_capture", None)
+    (tmp_path / "file").touch()
+    assert "is not a folder that can be written to" in error_of(capsys, "demo", "-o", tmp_path / "file" / "demo")
+
+
 def rewrite_npz(path, **changes):
     """The same .npz with some entries replaced."""
     with np.load(path) as archive:
@@ -390,3 +397,15 @@ def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys)
 def test_negative_coordinates_are_values_and_no_options(words):
     arguments = build_parser().parse_args(words.split())
     assert words.split()[-1] in vars(arguments).values()
+
+
+@pytest.mark.parametrize("names", [["chair"], ["a, b", "c"], ['17" screen', "x"], ["1,5 l", '"', "red mug"]])
+def test_names_with_commas_are_read_as_they_are_printed(names):
+    assert common.names_in(common.as_option(names)) == names
+
+
+def test_names_are_parted_by_commas_and_kept_whole_in_quotes():
+    assert common.names_in(' chair , "salt, pepper",, 17" screen\n table') == [
+        "chair", "salt, pepper", '17" screen', "table",
+    ]  # fmt: skip
+    assert common.names_in(None) is None

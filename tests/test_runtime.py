@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import sys
 import types
 import warnings
@@ -92,6 +93,12 @@ def test_metres_millimetres_and_map_coordinates_answer_alike(scene):
     shifted = replace(cloud, origin=np.array([2.0**20, -(2.0**22), 2.0**9]))
     assert (runtime.as_scene(kilo).instances_at(points * 1024) == metres).all()
     assert (runtime.as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
+
+
+@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 2, 3))])
+def test_what_are_no_points_is_refused_with_its_shape(scene, points):
+    with pytest.raises(OgPointcloudError, match=re.escape(f"shape {points.shape}; expected (N, 3)")):
+        scene.instances_at(points)
 
 
 def test_many_points_are_asked_in_runs(scene, monkeypatch):

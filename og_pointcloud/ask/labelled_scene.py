@@ -171,6 +171,10 @@ class LabelledScene:
     def _local(self, points: NDArray[np.floating]) -> FloatArray:
         """(N, 3) in the cloud's frame; infinite where that leaves float32."""
         points = np.asarray(points, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise OgPointcloudError(
+                f"points have shape {points.shape}; expected (N, 3), world coordinates: one point is [[x, y, z]]"
+            )
         local = np.empty(points.shape, np.float32)
         with np.errstate(over="ignore"):
             for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import json
 import math
 import os
@@ -46,7 +48,7 @@ class Parser(argparse.ArgumentParser):
 SHARED: dict[str, dict[str, Any]] = {
     "capture": {"type": Path, "metavar": "CAPTURE", "help": "folder with images and poses"},
     "bundle": {"type": Path, "metavar": "S.ogpc", "help": "what `fit` wrote"},
-    "--labels": {"metavar": "A,B,C", "help": "names to choose among (default: all that are known)"},
+    "--labels": {"metavar": "A,B,C", "help": 'names to choose among; of commas, "in, quotes" (default: all known)'},
     "--text-features": {
         "type": Path, "metavar": "F.npz",
         "help": "names and vectors, from the scene's encoder (default: the scene's own words)",
@@ -216,7 +218,7 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     output = report["output"]
     if cloud.vocabulary or find_encoder(cloud.feature_space, carried_encoder(output)):
         labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
-        print_next("segment", output, "--labels", ",".join(labels), "-o", labels_file(output))
+        print_next("segment", output, "--labels", as_option(labels), "-o", labels_file(output))
     else:
         print("no words are known yet: segment takes --text-features, or what export text makes of the masks' encoder")
         print_next("instances", output)
@@ -290,8 +292,18 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
 
 
 def names_in(text: str | None) -> list[str] | None:
-    """The names of an option like A,B,C; None where it is not given."""
-    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    """The names of an option like A,B,C; None where it is not given. One with a comma stands in double quotes."""
+    if text is None:
+        return None
+    rows = csv.reader(text.splitlines(), skipinitialspace=True)
+    return [name.strip() for row in rows for name in row if name.strip()]
+
+
+def as_option(names: Sequence[str]) -> str:
+    """The text that `names_in` reads these names in."""
+    line = io.StringIO()
+    csv.writer(line, lineterminator="").writerow(names)
+    return line.getvalue()
 
 
 def numbers(text: str, option: str, count: int) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, require_room
+from og_pointcloud.cli.common import Parser, add_option, check_output, require_room
 
 
 def add(parser: Parser) -> None:
@@ -22,6 +22,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     require_room()
+    check_output("-o", arguments.output / "room.ogpc", [])
     from og_pointcloud_room.demo import run_demo
 
     run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise, photographs=arguments.photographs)

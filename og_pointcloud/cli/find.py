@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"wrote {arguments.html}")
     if findings:
         best, given = findings[0], common.as_given(arguments, "--text-features")
-        common.print_next("view", collection.file(best.scene), "--labels", best.word, *given)
+        common.print_next("view", collection.file(best.scene), "--labels", common.as_option([best.word]), *given)
 
 
 def cells(finding: Finding) -> tuple[str, ...]:
