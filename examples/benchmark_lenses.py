@@ -11,6 +11,7 @@ its faces     as above
 Masks and features are simulated as for the demo, on each image as it is, but that the smallest mask has as many pixels
 in all of them as in the demo's: as a share of the image it would have 2.7 times as many on a panorama, a third on its
 faces. Points and truth are the same in all rows. Seconds are the processor's; the ratio is to those of pinhole images.
+The first fit compiles: for ratios take two runs or more (--runs), of which the least seconds count.
 """
 
 from __future__ import annotations
