@@ -18,7 +18,7 @@ from og_pointcloud.rendering.geometry import isotropic, neighbourhood
 from og_pointcloud.scene import CutMasks, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
-SETTINGS = FitSettings(geometry=GeometrySettings(scales=(0.5,)))
+SETTINGS = FitSettings(geometry=GeometrySettings(scales=(0.7,)))
 TILED = replace(SETTINGS, tile_points=400)
 
 
