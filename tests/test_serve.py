@@ -72,6 +72,20 @@ def test_a_word_of_any_length_is_answered_in_a_few_lines(pages):
     assert all("is not among the" in line and len(line) < 1000 for line in answer.lines)
 
 
+def test_an_answer_is_sent_before_colors_are_made(pages, monkeypatch):
+    """A browser shows what stands in the panel at once if no color is sent with it."""
+    live, sent = LiveScene(og.LabelledScene.from_cloud(room(300))), []
+    colors, page = live.colors, pages.serve({"room": live}, pages.ServeSettings(port=0))
+    try:
+        monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
+        monkeypatch.setattr(live, "colors", lambda: sent.append("colors") or colors())
+        page._word.value = "plum"
+        page._ask()
+    finally:
+        page.stop()
+    assert sent == [pages.answer_html(live.ask("plum")), "colors"]
+
+
 def test_a_notebook_shows_the_page_in_its_cell(pages):
     page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
     try:

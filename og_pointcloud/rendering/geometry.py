@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians, ascending
-from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import GeometrySettings
 
 TAMED_BY = 16
@@ -114,7 +114,8 @@ class Discs:
     @classmethod
     def of(cls, xyz: NDArray[np.float32], around: Neighbourhood) -> Discs:
         """By the plane that fits a point and its neighbours best. xyz: (n, 3)."""
-        return cls(drawn_spacing(xyz, around), *_planes(xyz, around.index))
+        normal, flatness = _planes(xyz, around.index)
+        return cls(drawn_spacing(xyz, around), normal, np.clip(flatness, FLATTEST, 1))
 
     @classmethod
     def round(cls, spacing: NDArray[np.float32]) -> Discs:
@@ -192,7 +193,7 @@ def _planes(xyz, index):  # noqa: ANN001, ANN202
                 longest = length
                 normal[g, 0], normal[g, 1], normal[g, 2] = u / length, v / length, w / length
         if longest > 0:
-            flatness[g] = min(max(np.sqrt(least / middle), FLATTEST), 1.0)
+            flatness[g] = np.sqrt(least / middle)
     return normal, flatness
 
 
@@ -313,15 +314,6 @@ def thinned(view: View, stride: int) -> View:
     first = stride // 2
     masks = np.ascontiguousarray(view.mask_map()[first::stride, first::stride])
     return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
-
-
-def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
-    """Round Gaussians with a standard deviation of ``scale`` times each point's spacing."""
-    n = len(points)
-    rotation = np.zeros((n, 4), np.float32)
-    rotation[:, 0] = 1
-    size = np.repeat((scale * spacing).astype(np.float32)[:, None], 3, axis=1)
-    return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
 
 
 def _depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:

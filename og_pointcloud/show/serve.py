@@ -250,8 +250,10 @@ class LivePage:
         setattr(self._points, attribute, self._live.colors())
 
     def _tell(self, answer: Answer) -> None:
-        self._paint()
+        """The answer first, by itself: a browser shows that at once, and colors with the next frame that it draws."""
         self._answer.content = answer_html(answer)
+        self._server.flush()
+        self._paint()
 
 
 def answer_html(answer: Answer) -> str:
