@@ -21,7 +21,7 @@ from og_pointcloud.mapping.frame_queue import FrameQueue
 from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
-from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.geometry import Discs, neighbourhood
 
 THINGS = [CHEST, BIN, CRATE]
 ELSEWHERE = moved(CRATE, (-0.9, 0.5, 0.0))
@@ -646,6 +646,18 @@ def test_snapshots_draw_points_as_large_as_a_fit_does():
                           strict=True):  # fmt: skip
         np.testing.assert_array_equal(one.columns, other.columns)
         np.testing.assert_array_equal(one.votes, other.votes)
+
+
+def test_known_points_are_drawn_along_their_surface_and_brought_ones_round():
+    known = og.Mapper(feature_space=SPACE, cloud=surface(THINGS, seed=3)[0])._map
+    xyz = known.points.xyz[: known.points.n]
+    found = known.discs_of(np.arange(len(xyz) + 5))
+    expected = Discs.of(xyz, neighbourhood(xyz, og.FitSettings().geometry))
+    np.testing.assert_allclose(found.flatness[: len(xyz)], expected.flatness, atol=1e-4)
+    np.testing.assert_allclose(found.spacing[: len(xyz)], expected.spacing, rtol=1e-4)
+    assert np.median(found.flatness[: len(xyz)]) < 0.5
+    np.testing.assert_array_equal(found.flatness[len(xyz) :], 1)
+    np.testing.assert_array_equal(found.spacing[len(xyz) :], np.float32(known.points.edge))
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.004])

@@ -651,7 +651,7 @@ def test_a_state_that_holds_something_else(tmp_path):
     for value in (3, ("a", "b"), ["a"]):
         data = packed(value)
         (tmp_path / "map.state").write_bytes(HEAD.pack(MAGIC, len(data), zlib.crc32(data)) + data)
-        with pytest.raises(OgPointcloudError, match="is damaged: remove the folder"):
+        with pytest.raises(OgPointcloudError, match="is damaged, or another version's: remove the folder"):
             MapJournal(tmp_path, "nothing").state()
 
 

@@ -90,7 +90,7 @@ class MapJournal:
             record = _next_record(file)
         content = None if record is None else unpacked(record, str(self._state))
         if not (isinstance(content, tuple) and len(content) == 2 and isinstance(content[1], GrowingMap)):
-            raise OgPointcloudError(f"{self._state} is damaged: remove the folder and map again")
+            raise OgPointcloudError(f"{self._state} is damaged, or another version's: remove the folder and map again")
         began_with, known = content
         if began_with != self._origin:
             raise OgPointcloudError(
@@ -109,7 +109,7 @@ class MapJournal:
             # It is about to be cut and written to: not through a link, and not if it is a file of something else.
             if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
                 raise OgPointcloudError(
-                    f"{self._log} was not written by a map: it is left as it is; give another folder"
+                    f"{self._log} was not written by a map of this version: it is left as it is; give another folder"
                 )
             while record := _next_record(file):
                 whole = file.tell()
