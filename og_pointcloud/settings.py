@@ -86,7 +86,7 @@ class GeometrySettings(_Checked):
 
     @property
     def middle_scale(self) -> float:
-        """The scale where views cannot be held out: fewer than four, or such that share nothing."""
+        """The scale where views cannot be held out: fewer than eight, or such that share nothing."""
         return self.scales[len(self.scales) // 2]
 
 
