@@ -65,7 +65,7 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
 class GeometrySettings(_Checked):
     """Gaussians of a plain cloud (geometry.py)."""
 
-    scales: tuple[float, ...] = (0.5, 0.7, 1.0)
+    scales: tuple[float, ...] = (0.35, 0.5, 0.7)
     """Standard deviations tried, in point spacings; those of the best labels of held-out views (held_out.py). Where the
     smallest or the largest is clearly the best, the search goes on beyond. One alone is taken as it is."""
     opacity: float = 0.9

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.rendering import geometry
 from og_pointcloud.rendering.geometry import (
-    FLATTEST,
     FLOATER,
     TAMED_BY,
-    Discs,
     along_curve,
     chance_of_place,
     drawn_spacing,
@@ -250,54 +248,3 @@ def test_neighbours_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.M
     few = neighbourhood(xyz, GeometrySettings())
     for name in ("spacing", "index", "adjoining"):
         np.testing.assert_array_equal(getattr(few, name), getattr(at_once, name))
-
-
-def reference_planes(xyz: NDArray[np.float32], index: NDArray[np.int32]) -> tuple[NDArray, NDArray]:
-    """Normals, and thickness beside width before it is held within its bounds; by eigenvectors in float64."""
-    near = np.concatenate([xyz[:, None], xyz[index]], axis=1).astype(np.float64)
-    near -= near.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near)
-    return vectors[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0) / values[:, 1])
-
-
-def test_discs_lie_in_the_plane_that_fits_the_neighbours_best(random: Generator) -> None:
-    xyz = random.normal(size=(600, 3))
-    xyz[:300] = xyz[:300] * [1, 1, 0.02] + [20, 0, 0]  # a rough sheet beside a ball of points
-    xyz = (xyz @ turned(random) + [30, -4, 9]).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
-    discs = Discs.of(xyz, around)
-    normal, flatness = reference_planes(xyz, around.index)
-    np.testing.assert_allclose(discs.flatness, np.clip(flatness, FLATTEST, 1), atol=1e-4)
-    clear = flatness < 0.7
-    np.testing.assert_allclose(np.abs((discs.normal * normal).sum(axis=1))[clear], 1, atol=1e-4)
-    assert np.median(discs.flatness[:300]) < 0.3
-    assert np.median(discs.flatness[300:]) > 0.5
-
-
-def turned(random: Generator) -> NDArray[np.float64]:
-    """A rotation."""
-    turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
-    return turn
-
-
-@pytest.mark.parametrize("points", ["one", "two", "same", "line", "huge"])
-def test_points_of_no_plane_are_drawn_round(points: str, random: Generator) -> None:
-    line = np.arange(20.0)[:, None] * [1, 2, 3]
-    xyz = {"one": line[:1], "two": line[:2], "same": np.zeros((30, 3)), "line": line, "huge": line * 1e30}[points]
-    discs = Discs.of(xyz.astype(np.float32), neighbourhood(xyz.astype(np.float32), SETTINGS))
-    np.testing.assert_array_equal(discs.flatness, 1)
-    np.testing.assert_allclose(np.linalg.norm(discs.normal, axis=1), 1, rtol=1e-6)
-
-
-def test_the_short_axis_of_a_disc_is_its_normal(random: Generator) -> None:
-    normal = random.normal(size=(50, 3))
-    normal = np.concatenate([normal / np.linalg.norm(normal, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
-    spacing, flatness = random.uniform(1, 2, 56), random.uniform(FLATTEST, 1, 56)
-    discs = Discs(*(part.astype(np.float32) for part in (spacing, normal, flatness)))
-    splats = discs.splats(np.zeros((56, 3), np.float32), 0.5, 0.9)
-    w, x, y, z = splats.rotation.T
-    first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    np.testing.assert_allclose(np.abs((first * normal).sum(axis=1)), 1, atol=1e-5)
-    np.testing.assert_allclose(
-        splats.scale, 0.5 * spacing[:, None] * np.stack([flatness, *np.ones((2, 56))], 1), rtol=1e-6
-    )

@@ -21,7 +21,7 @@ from og_pointcloud.mapping.frame_queue import FrameQueue
 from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
-from og_pointcloud.rendering.geometry import Discs, neighbourhood
+from og_pointcloud.rendering.geometry import neighbourhood
 
 THINGS = [CHEST, BIN, CRATE]
 ELSEWHERE = moved(CRATE, (-0.9, 0.5, 0.0))
@@ -634,30 +634,17 @@ def test_objects_know_since_when_they_stand_where_they_are():
 
 def test_snapshots_draw_points_as_large_as_a_fit_does():
     capture, given = scene(THINGS), without_depth(frames(THINGS))
-    geometry = replace(og.FitSettings().geometry, scales=(0.35, 0.5, 0.7))
-    settings = og.FitSettings(geometry=geometry)
-    cloud = og.fit(capture, settings, progress=False)
-    mapper, _ = mapped(given, cloud=capture.points, settings=settings)
+    cloud = og.fit(capture, progress=False)
+    mapper, _ = mapped(given, cloud=capture.points)
     mapper.snapshot()
     known, scale = mapper._map, cloud.provenance["notes"]["gaussian_scale"]
+    geometry = og.FitSettings().geometry
     assert known.scale == scale != geometry.middle_scale
     fixed = og.FitSettings(geometry=replace(geometry, scales=(scale,)))
     for one, other in zip(known.kept.views, mapped(given, cloud=capture.points, settings=fixed)[0]._map.kept.views,
                           strict=True):  # fmt: skip
         np.testing.assert_array_equal(one.columns, other.columns)
         np.testing.assert_array_equal(one.votes, other.votes)
-
-
-def test_known_points_are_drawn_along_their_surface_and_brought_ones_round():
-    known = og.Mapper(feature_space=SPACE, cloud=surface(THINGS, seed=3)[0])._map
-    xyz = known.points.xyz[: known.points.n]
-    found = known.discs_of(np.arange(len(xyz) + 5))
-    expected = Discs.of(xyz, neighbourhood(xyz, og.FitSettings().geometry))
-    np.testing.assert_allclose(found.flatness[: len(xyz)], expected.flatness, atol=1e-4)
-    np.testing.assert_allclose(found.spacing[: len(xyz)], expected.spacing, rtol=1e-4)
-    assert np.median(found.flatness[: len(xyz)]) < 0.5
-    np.testing.assert_array_equal(found.flatness[len(xyz) :], 1)
-    np.testing.assert_array_equal(found.spacing[len(xyz) :], np.float32(known.points.edge))
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.004])

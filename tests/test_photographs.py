@@ -14,11 +14,11 @@ from og_pointcloud.evaluate.baselines import center_sampling
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.photographs import Photographs
-from og_pointcloud.rendering.geometry import Discs, neighbourhood
+from og_pointcloud.rendering.geometry import isotropic, neighbourhood
 from og_pointcloud.scene import CutMasks, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
-SETTINGS = FitSettings(geometry=GeometrySettings(scales=(0.7,)))
+SETTINGS = FitSettings(geometry=GeometrySettings(scales=(0.5,)))
 TILED = replace(SETTINGS, tile_points=400)
 
 
@@ -52,7 +52,7 @@ def halves(view: View) -> list[View]:
 
 def as_gaussians(scene: Scene) -> Scene:
     xyz = scene.points.xyz
-    splats = Discs.round(neighbourhood(xyz, GeometrySettings()).spacing).splats(xyz, 0.7, 0.9)
+    splats = isotropic(scene.points, neighbourhood(xyz, GeometrySettings()).spacing, 0.7, 0.9)
     points = Points(xyz, scene.points.origin, None, splats.scale, splats.rotation, splats.opacity)
     return replace(scene, points=points)
 

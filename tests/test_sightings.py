@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from reference_splatting import in_camera, reference_alpha
 
-from og_pointcloud.rendering.geometry import Discs, neighbourhood
 from og_pointcloud.rendering.sightings import (
     EDGE_PX,
     LEAST_OPEN,
@@ -21,7 +20,6 @@ from og_pointcloud.rendering.sightings import (
 )
 from og_pointcloud.rendering.splatting import BATCH, Gaussians
 from og_pointcloud.scene import NOT_SEEN, Camera
-from og_pointcloud.settings import GeometrySettings
 
 CAMERA = Camera(48, 40, 60, 60, 24, 20, np.eye(4))
 NEAR = 0.1
@@ -173,19 +171,3 @@ def test_votes_are_those_of_every_sample_one_by_one(size: tuple[int, int]) -> No
             y = int(np.clip(np.floor(v[g] + down), 0, size[0] - 1))
             expected[max(ids[y, x], -1), g] += np.float64(open_[g]) * share
     np.testing.assert_array_equal(sightings_of(open_, u, v, ids, 3).rows.toarray(), expected)
-
-
-def test_a_slanted_surface_does_not_hide_itself_and_hides_what_is_below() -> None:
-    """Round points stand up from their surface: seen at a slant, the near ones hide those behind them."""
-    camera = Camera(480, 400, 600, 600, 240, 200, np.eye(4))
-    across, ahead = np.meshgrid(np.linspace(-1, 1, 81), np.linspace(1, 4, 121))
-    floor = np.stack([across, np.full(across.shape, 0.25), ahead], axis=-1).reshape(-1, 3)  # below the camera
-    xyz = np.concatenate([floor, np.add(floor, [0, 0.3, 0])]).astype(np.float32)
-    discs = Discs.of(xyz, neighbourhood(xyz, GeometrySettings()))
-    thickness = np.full(len(xyz), 0.075, np.float32)
-    balls = replace(discs, flatness=np.ones_like(discs.flatness))
-    as_discs, as_balls = (openness(d.splats(xyz, 0.7, 0.9), camera, NEAR, thickness)[0] > 0.5 for d in (discs, balls))
-    seen, is_floor = camera.shows(camera.project(xyz)[0]), np.arange(len(xyz)) < len(floor)
-    assert as_discs[seen & is_floor].mean() > 0.75
-    assert as_balls[seen & is_floor].mean() < 0.1
-    assert as_discs[seen & ~is_floor].mean() < 0.25

@@ -25,7 +25,6 @@ from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, _opened, split
 from og_pointcloud.fitting.work_folder import WorkFolder, kept_files
-from og_pointcloud.rendering.geometry import Discs
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -190,8 +189,7 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
 
 def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     cloud = TiledCloud.cut(points, len(points), SETTINGS, work)
-    discs = Discs.round(np.full(len(points), spacing, np.float32))
-    work.array("spacing", cloud.key, lambda: np.stack([discs.spacing, discs.spacing, *discs.normal.T, discs.flatness]))
+    work.array("spacing", cloud.key, lambda: np.full((2, len(points)), spacing, np.float32))
     return cloud
 
 

@@ -16,7 +16,7 @@ from og_pointcloud.formats import capture
 from og_pointcloud.formats.capture import read_capture, read_poses
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
-from og_pointcloud.rendering.geometry import Discs
+from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.scene import NOT_SEEN
 
 FACES = ["front", "left", "right", "up", "down", "back"]
@@ -201,7 +201,7 @@ def test_what_the_lens_did_not_see_says_nothing(tmp_path):
     assert any((ids == NOT_SEEN).any() for ids in maps.values())
     points = scene.points
     spacing = np.full(len(points), 0.02, np.float32)
-    cloud = Discs.round(spacing).splats(points.xyz, 0.5, 0.9)
+    cloud = isotropic(points, spacing, 0.5, 0.9)
     for by_sight in (True, False):
         table = mask_table(cloud, scene.views, 0.01, spacing, by_sight=by_sight)
         for index, view in enumerate(scene.views):

@@ -46,7 +46,6 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.held_out.CLEARLY": ("table", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
     "rendering.geometry.SPARSE": ("table", ()),
-    "rendering.geometry.FLATTEST": ("table", ()),
     "rendering.geometry.SCATTERED": ("table", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -73,7 +72,6 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
         "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "fitting.held_out.CLEARLY",
         "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",
-        "rendering.geometry.FLATTEST",
         "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip

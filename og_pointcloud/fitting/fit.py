@@ -24,7 +24,7 @@ from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
-from og_pointcloud.rendering.geometry import Discs, thinned
+from og_pointcloud.rendering.geometry import drawn_spacing, isotropic, thinned
 from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
@@ -179,11 +179,11 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
     if not surface.by_sight:
         return surface
     points = surface.scene.points
-    discs = Discs.of(points.xyz, surface.neighbourhood)
+    spacing = drawn_spacing(points.xyz, surface.neighbourhood)
     with journal.stage("point size"):
-        choice = choose_scale(points, discs, surface.thickness, surface.scene.views, surface.near, settings, journal)
+        choice = choose_scale(points, spacing, surface.thickness, surface.scene.views, surface.near, settings, journal)
         note_scale(choice, journal)
-    return replace(surface, gaussians=discs.splats(points.xyz, choice.scale, settings.geometry.opacity))
+    return replace(surface, gaussians=isotropic(points, spacing, choice.scale, settings.geometry.opacity))
 
 
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:

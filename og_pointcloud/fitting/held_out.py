@@ -23,7 +23,7 @@ from og_pointcloud.fitting.membership import SceneVotes, assign_points, views_wi
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.geometry import Discs, Neighbourhood, neighbourhood, sample_of_points
+from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
@@ -49,7 +49,7 @@ class ScaleChoice:
 
 def choose_scale(
     points: Points,
-    discs: Discs,
+    spacing: NDArray[np.float32],
     thickness: NDArray[np.float32],
     views: Sequence[View],
     near: float,
@@ -59,7 +59,7 @@ def choose_scale(
     """The scale whose labels of half of the views reproduce the masks of the other half best: of the settings' own, and
     of smaller or larger ones while these are clearly better.
 
-    discs: how the points are drawn. thickness: (n,) of their surfaces. near: depth of the near plane. Only some
+    spacing: (n,) that points are drawn by. thickness: (n,) of their surfaces. near: depth of the near plane. Only some
     views and points are asked (see settings), but all points hide others. Does not depend on the order of views or
     points.
     """
@@ -84,7 +84,7 @@ def choose_scale(
 
     def shown(scale: float) -> list[MaskTable]:
         """What either half of the views shows with points of a scale."""
-        drawn = discs.splats(points.xyz, scale, geometry.opacity)
+        drawn = isotropic(points, spacing, scale, geometry.opacity)
         tables = (mask_table(drawn, half, near, thickness, by_sight=True, asked=asked) for half in halves)
         return [table.of_points(sample) for table in tables]
 

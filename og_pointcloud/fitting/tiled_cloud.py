@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
-from og_pointcloud.rendering.geometry import Discs, Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -115,10 +115,9 @@ class TiledCloud:
         return self.work.array("spacing", self.key, vanished)[0]
 
     @cached_property
-    def discs(self) -> Discs:
-        """How the points are drawn."""
-        _, spacing, *normal, flatness = self.work.array("spacing", self.key, vanished)
-        return Discs(spacing, np.stack(normal, axis=1), flatness)
+    def drawn_spacing(self) -> NDArray[np.float32]:
+        """(n,) float32, as of `geometry.drawn_spacing`."""
+        return self.work.array("spacing", self.key, vanished)[1]
 
     def inner(self, tile: int) -> slice:
         """Which of a tile's members are its own points and not of its margin: these lie in one stretch."""

@@ -44,8 +44,9 @@ from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
-    Discs,
     chance_of_place,
+    drawn_spacing,
+    isotropic,
     near_plane,
     neighbourhood,
     sample_of_points,
@@ -165,10 +166,9 @@ def _points_per_tile(points: int, left: int) -> int:
 
 
 def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
-    """(6, points of the tile) their spacing, and what `Discs` has of them."""
-    around = cloud.neighbours(tile, settings.geometry)
-    discs = Discs.of(cloud.points.xyz[cloud.members[tile]], around)
-    return np.stack([around.spacing, discs.spacing, *discs.normal.T, discs.flatness])[:, cloud.inner(tile)]
+    """(2, points of the tile) their spacing, and the one that they are drawn by."""
+    around, members = cloud.neighbours(tile, settings.geometry), cloud.members[tile]
+    return np.stack([around.spacing, drawn_spacing(cloud.points.xyz[members], around)])[:, cloud.inner(tile)]
 
 
 # Views ----------------------------------------------------------------------------------------------------------
@@ -190,8 +190,7 @@ class _Drawing:
         if self.scale is None or self.opacity is None:
             splats = Gaussians.from_points(chosen)
             return replace(splats, scale=splats.scale * larger[:, None])
-        discs = cloud.discs.take(rows)
-        return replace(discs, spacing=discs.spacing * larger).splats(chosen.xyz, self.scale, self.opacity)
+        return isotropic(chosen, cloud.drawn_spacing[rows] * larger, self.scale, self.opacity)
 
 
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
@@ -201,14 +200,14 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
     if points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return _Drawing(None, None, near, typical)
-    few, spacing, discs = points, cloud.spacing, cloud.discs
+    few, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
     if len(points) > CHOICE_POINTS:
         journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
         few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
         around = neighbourhood(few.xyz, geometry)
-        spacing, discs = around.spacing, Discs.of(few.xyz, around)
+        spacing, drawn = around.spacing, drawn_spacing(few.xyz, around)
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
-    choice = choose_scale(few, discs, thickness, views, near, settings, journal)
+    choice = choose_scale(few, drawn, thickness, views, near, settings, journal)
     note_scale(choice, journal)
     return _Drawing(choice.scale, geometry.opacity, near, typical)
 
@@ -354,7 +353,7 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
     to fall to ALPHA_MIN. The projection is linearized within a margin of the image: there a round one is widened.
     """
-    points, spacing, drawn = cloud.points, cloud.spacing[part], cloud.discs.spacing[part]
+    points, spacing, drawn = cloud.points, cloud.spacing[part], cloud.drawn_spacing[part]
     widest = drawn * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         uv_px, depth = camera.project(points.xyz[part])

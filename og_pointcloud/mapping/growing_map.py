@@ -26,11 +26,11 @@ from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
-from og_pointcloud.rendering.geometry import Discs
+from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
 from og_pointcloud.rendering.surface import sight_thickness
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, Points
 from og_pointcloud.settings import GeometrySettings
 
 MARGIN = 0.1
@@ -47,15 +47,14 @@ RECENT_FRAMES = 4096
 class GrowingMap:
     """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought points. sequence: number
     of the next frame; 0 stands for what was known before the first. stamp: the latest of all frames; recent: those of
-    the last RECENT_FRAMES, in the order of their coming. discs: how points are drawn for frames without depth: each of
-    the first rows, those known from the beginning, and last, one for all that frames brought. scale: how large, in
-    spacings; None: not chosen yet. drawn: how many such frames were kept when it was chosen."""
+    the last RECENT_FRAMES, in the order of their coming. spacing: of each of the first rows, the points known from the
+    beginning. scale: how large points are drawn for frames without depth, in spacings; None: not chosen yet. drawn: how
+    many such frames were kept when it was chosen."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
     points: VoxelPoints
     presence: Presence
-    discs: Discs
     votes: PointVotes = field(default_factory=PointVotes)
     tracks: Tracks = field(default_factory=Tracks)
     kept: KeptViews = field(default_factory=KeptViews)
@@ -63,6 +62,7 @@ class GrowingMap:
     sequence: int = 1
     stamp: float = -1.0
     recent: list[float] = field(default_factory=list)
+    spacing: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     scale: float | None = None
     drawn: int = 0
 
@@ -74,8 +74,7 @@ class GrowingMap:
         """A map without points. grows: whether frames add some. scatter: standard deviation of points off their
         surface."""
         presence = Presence(tolerance_of(spacing, scatter), MOST_ODDS)
-        brought = Discs.round(np.array([spacing], np.float32))
-        return cls(origin, space, VoxelPoints(spacing, grows), presence, brought)
+        return cls(origin, space, VoxelPoints(spacing, grows), presence)
 
     def grow(self) -> None:
         """Make room for what is known of each point."""
@@ -89,9 +88,9 @@ class GrowingMap:
         rows = rows[:: 1 + len(rows) // most]
         return rows[self.points.weight[rows] > 0]
 
-    def discs_of(self, rows: NDArray[np.int32]) -> Discs:
-        """How some points are drawn."""
-        return self.discs.take(np.minimum(rows, len(self.discs.spacing) - 1))
+    def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
+        """(m,) spacing of points; for those that frames brought it is the edge of a voxel."""
+        return np.append(self.spacing, np.float32(self.points.edge))[np.minimum(rows, len(self.spacing))]
 
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Count what a view measures for and against points; rows of those that it confirms, and of those that must
@@ -233,11 +232,11 @@ def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int
 def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
     """The points that a frame without depth sees: those that the map's own points, drawn as `fit` does, do not hide."""
     camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
-    xyz, discs = known.points.xyz[rows], known.discs_of(rows)
-    drawn = discs.splats(xyz, known.scale or geometry.middle_scale, geometry.opacity)
+    xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
+    drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
     depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
-    open_, u, v = openness(drawn, camera, near, sight_thickness(discs.spacing, known.points.edge, geometry))
+    open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, known.points.edge, geometry))
     return _seen(frame, rows, open_, np.stack([u, v], axis=1))
 
 

@@ -14,7 +14,7 @@ from og_pointcloud.journal import Journal
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points
 from og_pointcloud.mapping.kept_views import KeptView
-from og_pointcloud.rendering.geometry import Discs, Neighbourhood, near_plane
+from og_pointcloud.rendering.geometry import Neighbourhood, drawn_spacing, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
@@ -28,9 +28,9 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
     # First, as it may see the frames without depth anew: the table is made of what they see.
-    discs = Discs.of(points.xyz, around)
+    spacing = drawn_spacing(points.xyz, around)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), settings.geometry)
-    _choose_scale(known, points, discs, thickness, settings, journal)
+    _choose_scale(known, points, spacing, thickness, settings, journal)
     table = known.kept.table(place, len(rows))
     # The table holds all that the masks say; the scene's views are there for their cameras.
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
@@ -38,7 +38,7 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     kept = zip(table.names, known.kept.views, strict=True)
     views = tuple(View(name, view.camera, no_mask, no_feature) for name, view in kept)
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
-    drawn = discs.splats(points.xyz, known.scale or geometry.middle_scale, geometry.opacity)
+    drawn = isotropic(points, spacing, known.scale or geometry.middle_scale, geometry.opacity)
     near = near_plane(points.xyz, (view.camera for view in views))
     surface = Surface(scene, None, around, drawn, near, thickness, 1, by_sight=True)
     table = front_surfaces(surface, table, settings, journal)
@@ -48,7 +48,7 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
 def _choose_scale(
     known: GrowingMap,
     points: Points,
-    discs: Discs,
+    spacing: NDArray[np.float32],
     thickness: NDArray[np.float32],
     settings: FitSettings,
     journal: Journal,
@@ -61,7 +61,7 @@ def _choose_scale(
         return
     views = [View(f"{k:09d}", kept[k].camera, kept[k].masks, kept[k].features) for k in drawn]
     near = near_plane(points.xyz, (view.camera for view in views))
-    scale = choose_scale(points, discs, thickness, views, near, settings, journal).scale
+    scale = choose_scale(points, spacing, thickness, views, near, settings, journal).scale
     known.drawn, before, known.scale = len(drawn), known.scale or settings.geometry.middle_scale, scale
     for k in drawn if scale != before else ():
         view = kept[k]

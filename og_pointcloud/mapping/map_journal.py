@@ -39,20 +39,19 @@ from og_pointcloud.mapping.likeness import Look
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.tracks import PointVotes, Track, Tracks
 from og_pointcloud.mapping.voxels import Packets, VoxelHash, VoxelPoints
-from og_pointcloud.rendering.geometry import Discs
 from og_pointcloud.scene import Camera
 
 KINDS = {
     kind.__name__: kind
     for kind in (
-        Camera, Discs, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Look, Packets, PointVotes, Presence, Track,
+        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Look, Packets, PointVotes, Presence, Track,
         Tracks, VoxelHash, VoxelPoints,
     )
 }  # fmt: skip
 """Dataclasses that a record may hold, by name: nothing else is ever made from a file."""
 HEAD = struct.Struct("<4sQI")
 """Of a record: MAGIC, bytes that follow, and their CRC-32."""
-MAGIC = b"OGF4"
+MAGIC = b"OGF3"
 LOG_BYTES = 1 << 27
 """Bytes of changes after which the whole map is written and the log begins anew."""
 

@@ -37,7 +37,7 @@ from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
-from og_pointcloud.rendering.geometry import Discs, Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points, require_finite
 from og_pointcloud.settings import FitSettings, fit_settings
 
@@ -125,8 +125,7 @@ class Mapper:
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
         self._rows = self._map.points.add_known(points.xyz, points.rgb)
-        discs = Discs.of(points.xyz, self._around).take(np.argsort(self._rows))
-        self._map.discs = discs.followed_by(self._map.discs)
+        self._map.spacing = self._around.spacing[np.argsort(self._rows)]
         self._map.grow()
         return self._map
 

@@ -1,7 +1,7 @@
 """What a fit asks of points before anything is drawn: spacing, neighbours, samples, the pixels worth looking at.
 
-A plain cloud's points are drawn as discs along their surface, of a share of their own spacing; `fitting.held_out`
-chooses the share.
+A plain cloud's points are drawn as isotropic Gaussians of a share of their own spacing; `fitting.held_out` chooses the
+share.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians, ascending
-from og_pointcloud.scene import Camera, View
+from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
 TAMED_BY = 16
@@ -30,10 +29,6 @@ SCATTERED = 0.1
 alike. Of a surface it is less the sparser it is beside its noise."""
 FLOATER = 0.1
 """Floaters are drawn so many typical spacings apart: they hide next to nothing."""
-FLATTEST = 0.1
-"""A disc is so thick beside its width where the points about it lie in a plane."""
-A_LINE = 1e-6
-"""Points whose spread across the line that fits them best is less than this share of it lie on a line: of no plane."""
 ROWS_AT_ONCE = 1 << 18
 """Points whose neighbours are looked up at once: the look-up returns three times as many bytes as are kept."""
 
@@ -96,105 +91,6 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     # Where points are denser than is typical, they adjoin as far as elsewhere.
     adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
     return Neighbourhood(spacing, index, adjoining)
-
-
-@dataclass(frozen=True)
-class Discs:
-    """How the points of a plain cloud are drawn: as wide as they are apart, and as thick as the surface about them is
-    rough. So what is close behind a slanted surface's edge is hidden by it, and the surface itself is not.
-
-    spacing: (n,) float32, as of `drawn_spacing`, scene units. normal: (n, 3) float32, of length one, its sign means
-    nothing. flatness: (n,) float32 in [FLATTEST, 1], thickness beside width; 1 is round.
-    """
-
-    spacing: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    flatness: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, xyz: NDArray[np.float32], around: Neighbourhood) -> Discs:
-        """By the plane that fits a point and its neighbours best. xyz: (n, 3)."""
-        normal, flatness = _planes(xyz, around.index)
-        return cls(drawn_spacing(xyz, around), normal, np.clip(flatness, FLATTEST, 1))
-
-    @classmethod
-    def round(cls, spacing: NDArray[np.float32]) -> Discs:
-        """Of points about which nothing else is known. spacing: (n,)."""
-        normal = np.tile(np.array([1, 0, 0], np.float32), (len(spacing), 1))
-        return cls(spacing, normal, np.ones(len(spacing), np.float32))
-
-    def take(self, rows: NDArray[np.integer]) -> Discs:
-        """Those of some points."""
-        return Discs(self.spacing[rows], self.normal[rows], self.flatness[rows])
-
-    def followed_by(self, more: Discs) -> Discs:
-        """Those of all points of both."""
-        both = (self.spacing, more.spacing), (self.normal, more.normal), (self.flatness, more.flatness)
-        return Discs(*(np.concatenate(parts) for parts in both))
-
-    def splats(self, xyz: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
-        """Gaussians of which two axes are ``scale`` spacings long (standard deviations), and the third, along the
-        normal, is shorter."""
-        width = (scale * self.spacing).astype(np.float32)
-        # The shortest turn from the first axis to the normal, whose sign is free: never half a turn.
-        normal = self.normal * np.where(self.normal[:, :1] < 0, -1, 1).astype(np.float32)
-        turn = np.stack([1 + normal[:, 0], np.zeros(len(xyz)), -normal[:, 2], normal[:, 1]], axis=1)
-        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-        size = np.stack([width * self.flatness, width, width], axis=1)
-        return Gaussians(xyz, size, turn.astype(np.float32), np.full(len(xyz), opacity, np.float32))
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _planes(xyz, index):  # noqa: ANN001, ANN202
-    """(n, 3) float32 normals of the planes through each point and its neighbours, and (n,) float32, how far these lie
-    across it beside along it: the root of the ratio of their covariance's two smaller eigenvalues."""
-    normal, flatness = np.zeros((len(xyz), 3), np.float32), np.ones(len(xyz), np.float32)
-    for g in prange(len(xyz)):
-        normal[g, 0] = 1
-        # Seen from the point itself, so that no digits are lost far from the origin.
-        x, y, z, xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(index.shape[1]):
-            h = index[g, k]
-            u, v = np.float64(xyz[h, 0]) - xyz[g, 0], np.float64(xyz[h, 1]) - xyz[g, 1]
-            w = np.float64(xyz[h, 2]) - xyz[g, 2]
-            x, y, z = x + u, y + v, z + w
-            xx, xy, xz, yy, yz, zz = xx + u * u, xy + u * v, xz + u * w, yy + v * v, yz + v * w, zz + w * w
-        n = index.shape[1] + 1
-        xx, xy, xz = xx - x * x / n, xy - x * y / n, xz - x * z / n
-        yy, yz, zz = yy - y * y / n, yz - y * z / n, zz - z * z / n
-        trace = xx + yy + zz
-        if not 0 < trace < np.inf:
-            continue
-        xx, xy, xz, yy, yz, zz = xx / trace, xy / trace, xz / trace, yy / trace, yz / trace, zz / trace
-        # Eigenvalues of a symmetric 3x3 matrix in closed form, by the angle whose cosine solves the cubic.
-        third = 1 / 3
-        a, b, c = xx - third, yy - third, zz - third
-        p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-        if p < A_LINE:
-            continue  # a ball
-        cosine = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) / (2 * p * p * p)
-        angle = np.arccos(min(max(cosine, -1.0), 1.0)) / 3
-        least = max(third + 2 * p * np.cos(angle + 2 * np.pi / 3), 0.0)
-        middle = 1 - least - (third + 2 * p * np.cos(angle))
-        if middle < A_LINE:
-            continue
-        # Across two rows of what is left without it lies the eigenvector; the longest of the three products is exact.
-        a, b, c = xx - least, yy - least, zz - least
-        longest = 0.0
-        for i in range(3):
-            if i == 0:
-                u, v, w = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
-            elif i == 1:
-                u, v, w = xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz
-            else:
-                u, v, w = b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz
-            length = np.sqrt(u * u + v * v + w * w)
-            if length > longest:
-                longest = length
-                normal[g, 0], normal[g, 1], normal[g, 2] = u / length, v / length, w / length
-        if longest > 0:
-            flatness[g] = np.sqrt(least / middle)
-    return normal, flatness
 
 
 def drawn_spacing(xyz: NDArray[np.float32], around: Neighbourhood) -> NDArray[np.float32]:
@@ -314,6 +210,15 @@ def thinned(view: View, stride: int) -> View:
     first = stride // 2
     masks = np.ascontiguousarray(view.mask_map()[first::stride, first::stride])
     return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
+
+
+def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
+    """Round Gaussians with a standard deviation of ``scale`` times each point's spacing."""
+    n = len(points)
+    rotation = np.zeros((n, 4), np.float32)
+    rotation[:, 0] = 1
+    size = np.repeat((scale * spacing).astype(np.float32)[:, None], 3, axis=1)
+    return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
 
 
 def _depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:

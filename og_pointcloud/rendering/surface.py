@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
-    Discs,
     Neighbourhood,
     along_curve,
     distinct_places,
+    isotropic,
     near_plane,
     neighbourhood,
     thinned,
@@ -104,15 +104,14 @@ def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> 
 
 
 def _gaussians(scene: Scene, around: Neighbourhood, settings: FitSettings, journal: Journal) -> Gaussians:
-    """The file's own Gaussians; of a plain cloud round ones, in whose place a fit may draw discs later."""
+    """The file's own Gaussians; of a plain cloud round ones, whose size `held_out` may change later."""
     if scene.points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return Gaussians.from_points(scene.points)
-    round_ones = Discs.round(around.spacing)
     if settings.mode == "paper":
         journal.leave_out(LeftOut.CHOICE_IN_PAPER_MODE)
-        return round_ones.splats(scene.points.xyz, settings.paper.scale, settings.paper.opacity)
-    return round_ones.splats(scene.points.xyz, settings.geometry.middle_scale, settings.geometry.opacity)
+        return isotropic(scene.points, around.spacing, settings.paper.scale, settings.paper.opacity)
+    return isotropic(scene.points, around.spacing, settings.geometry.middle_scale, settings.geometry.opacity)
 
 
 def sight_thickness(

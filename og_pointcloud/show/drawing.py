@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.picking import in_world
-from og_pointcloud.rendering.geometry import Discs
+from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Camera, Points
 
@@ -18,7 +18,7 @@ SCALE, OPACITY = 0.7, 0.95
 
 def as_splats(points: Points, spacing: float) -> Points:
     """The points as round splats. spacing: typical distance between neighboring points."""
-    splats = Discs.round(np.full(len(points), spacing, np.float32)).splats(points.xyz, SCALE, OPACITY)
+    splats = isotropic(points, np.full(len(points), spacing, np.float32), SCALE, OPACITY)
     return replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
 
 
