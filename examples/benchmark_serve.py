@@ -52,9 +52,9 @@ WATCH = """
       if (document.body.innerText === text) return
       window.told = since()
       observer.disconnect()
+      requestAnimationFrame(look)  // not before: to read what is drawn waits for a frame, and so would the answer
     }).observe(document.body, changed)
     const look = () => { if (seen() === before) requestAnimationFrame(look); else window.lit = since() }
-    requestAnimationFrame(look)
   }, { once: true })
 }"""
 
