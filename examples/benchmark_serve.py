@@ -43,13 +43,13 @@ WATCH = """
   const view = document.querySelector("canvas[data-engine]"), box = document.querySelector("form input")
   const pen = Object.assign(document.createElement("canvas"), { width: 64, height: 48 }).getContext("2d")
   const seen = () => { pen.drawImage(view, 0, 0, 64, 48); return pen.getImageData(0, 0, 64, 48).data.join() }
-  const before = seen(), text = document.body.innerText
+  const before = seen()
   window.lit = window.told = 0
   box.addEventListener("input", () => {
     const start = performance.now(), since = () => performance.now() - start
     const changed = { childList: true, characterData: true, subtree: true }
     new MutationObserver((_, observer) => {
-      if (document.body.innerText === text) return
+      if (![...document.querySelectorAll("b")].some((title) => title.textContent === box.value)) return
       window.told = since()
       observer.disconnect()
       requestAnimationFrame(look)  // not before: to read what is drawn waits for a frame, and so would the answer
