@@ -35,14 +35,22 @@ WINDOW = {"width": 1100, "height": 700}
 KEPT = """
 const original = HTMLCanvasElement.prototype.getContext
 HTMLCanvasElement.prototype.getContext = function (kind, options) {
-  return original.call(this, kind, { ...options, preserveDrawingBuffer: true }) }
+  const context = original.call(this, kind, { ...options, preserveDrawingBuffer: true })
+  if (kind === "webgl2") window.pen = context
+  return context }
+window.draws = 0
+for (const name of ["drawArrays", "drawElements"]) {
+  const draw = WebGL2RenderingContext.prototype[name]
+  WebGL2RenderingContext.prototype[name] = function (...values) { window.draws += 1; draw.apply(this, values) } }
 """
-"""What is drawn can be read at any time."""
+"""What is drawn can be read at any time, and draws are counted."""
 WATCH = """
 () => {
-  const view = document.querySelector("canvas[data-engine]"), box = document.querySelector("form input")
-  const pen = Object.assign(document.createElement("canvas"), { width: 64, height: 48 }).getContext("2d")
-  const seen = () => { pen.drawImage(view, 0, 0, 64, 48); return pen.getImageData(0, 0, 64, 48).data.join() }
+  const box = document.querySelector("form input"), pen = window.pen
+  const row = new Uint8Array(4 * pen.drawingBufferWidth)
+  const seen = () => {
+    pen.readPixels(0, pen.drawingBufferHeight >> 1, pen.drawingBufferWidth, 1, pen.RGBA, pen.UNSIGNED_BYTE, row)
+    return row.join() }
   const before = seen()
   window.lit = window.told = 0
   box.addEventListener("input", () => {
@@ -52,9 +60,13 @@ WATCH = """
       if (![...document.querySelectorAll("b")].some((title) => title.textContent === box.value)) return
       window.told = since()
       observer.disconnect()
-      requestAnimationFrame(look)  // not before: to read what is drawn waits for a frame, and so would the answer
     }).observe(document.body, changed)
-    const look = () => { if (seen() === before) requestAnimationFrame(look); else window.lit = since() }
+    let drawn = window.draws
+    const look = () => {
+      // To read waits for the frame: only where there is a new one, and the answer was not held up by it.
+      if (window.told && window.draws !== drawn) { drawn = window.draws; if (seen() !== before) window.lit = since() }
+      if (!window.lit) requestAnimationFrame(look) }
+    requestAnimationFrame(look)
   }, { once: true })
 }"""
 

@@ -6,9 +6,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +19,12 @@ from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
+from og_pointcloud.ask.picking import front_points
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.show.changes_page import both_visits, write_changes_page
 from og_pointcloud.show.live import CHANGES, Answer, LiveScene
+from og_pointcloud.show.viewpoint import Viewpoint
 
 BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 
@@ -185,8 +189,106 @@ def until(true, seconds=60):
         time.sleep(0.2)
 
 
+class Browser:
+    """In viser's place: a browser that takes so many seconds for a picture with points, and without them."""
+
+    def __init__(self, monkeypatch, with_points, without):
+        self.seconds, self.clock, self.drawn, self.pictures = (without, with_points), 0.0, None, []
+        self.scene = self
+        eye = Viewpoint(np.array([2.0, 1.5, 2.5]), np.zeros(3), np.array([0, 0, 1.0]))
+        self.seen_by = eye.camera(160, 120, 100)
+        from viser.transforms import SO3
+
+        self.camera = SimpleNamespace(
+            on_update=lambda turned: setattr(self, "turned", turned),
+            image_width=160, image_height=120, fov=2 * np.arctan(60 / 100), position=eye.eye,
+            wxyz=SO3.from_matrix(self.seen_by.world_to_camera[:3, :3].T).wxyz,
+        )  # fmt: skip
+        monkeypatch.setattr("og_pointcloud.show.screen.time", SimpleNamespace(monotonic=lambda: self.clock))
+
+    def add_point_cloud(self, name, xyz, colors, **_):
+        self.drawn = SimpleNamespace(colors=colors, visible=True)
+        return self.drawn
+
+    def set_background_image(self, picture, *_, **__):
+        self.pictures.append(picture)
+
+    def get_render(self, height, width, timeout):
+        seconds = self.seconds[self.drawn.visible]
+        if seconds > timeout:
+            raise TimeoutError
+        self.clock += seconds
+
+    def flush(self):
+        pass
+
+
+@pytest.fixture
+def shown_in(pages, monkeypatch):
+    """A scene as browsers of some speed show it: the scene, the browser and its screen, once it was timed."""
+    from og_pointcloud.show.screen import Screen
+
+    screens = []
+
+    def shown(with_points, without, count=300):
+        browser, live = Browser(monkeypatch, with_points, without), LiveScene(og.LabelledScene.from_cloud(room(count)))
+        timed = threading.Event()
+        monkeypatch.setattr(Screen, "_time", lambda *args, time=Screen._time: (time(*args), timed.set()))
+        screens.append(Screen(browser))
+        screens[-1].show(live, np.zeros(3), 1.0)
+        assert timed.wait(60)
+        return live, browser, screens[-1]
+
+    yield shown
+    for screen in screens:
+        screen.close()
+
+
+@pytest.mark.parametrize(("with_points", "without", "slow"), [
+    (0.02, 0.01, False), (0.9, 0.8, False), (0.9, 0.1, True), (np.inf, np.inf, False)
+], ids=["quick", "far away", "slow", "not looked at"])  # fmt: skip
+def test_a_browser_that_draws_points_slowly_is_sent_pictures(shown_in, with_points, without, slow):
+    live, browser, screen = shown_in(with_points, without)
+    assert (screen.sends_pictures, browser.drawn.visible) == (slow, not slow)
+    live.ask("plum")
+    screen.paint(live.colors())
+    assert np.array_equal(browser.drawn.colors, live.colors()) == (not slow)
+
+
+def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
+    live, browser, screen = shown_in(0.9, 0.1)
+    until(lambda: len(browser.pictures) > 1)  # the first one takes an older one away
+    front = front_points(live.scene.cloud, browser.seen_by)
+    assert (front >= 0).sum() > 500
+    for word in ("", "plum"):
+        live.ask(word)
+        screen.paint(live.colors())
+        assert np.array_equal(browser.pictures[-1], np.append(live.colors(), [[255] * 3], axis=0)[front])
+    assert (browser.pictures[-1] != browser.pictures[-2]).any()
+    screen.resize(2.0)
+    until(lambda: (browser.pictures[-1] != 255).any(axis=2).sum() > 1.2 * (front >= 0).sum())
+
+
+def test_while_the_view_turns_a_picture_is_of_fewer_points(shown_in, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("og_pointcloud.show.screen.TURNING_POINTS", 200)
+    monkeypatch.setattr(
+        "og_pointcloud.show.screen.front_points",
+        lambda points, camera: drawn.append(points) or front_points(points, camera),
+    )
+    live, browser, _screen = shown_in(0.9, 0.1, count=1000)
+    until(lambda: len(drawn) == 2)
+    browser.turned(None)
+    until(lambda: len(drawn) == 4)
+    assert [len(points.xyz) for points in drawn] == [len(live.xyz[::step]) for step in (6, 1, 6, 1)]
+    assert np.allclose([points.spacing for points in drawn[:2]], live.scene.cloud.spacing * np.sqrt([6, 1]))
+    assert np.array_equal(drawn[0].xyz, live.xyz[::6].astype(np.float32))
+
+
 @pytest.mark.slow
-def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, window):
+@pytest.mark.parametrize("sent", ["points", "pictures"])
+def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, window, monkeypatch, sent):
+    monkeypatch.setattr("og_pointcloud.show.screen.SLOW_S", np.inf if sent == "points" else -np.inf)
     # Two plates, one above the other in the picture, each an instance of its own and of one color.
     plate = np.stack(np.meshgrid(np.arange(0, 2, 0.02), np.arange(0, 0.9, 0.02)), axis=-1).reshape(-1, 2)
     xyz = np.concatenate([np.c_[plate, np.zeros(len(plate))], np.c_[plate + np.array([0, 1.1]), np.zeros(len(plate))]])
@@ -202,6 +304,7 @@ def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, windo
             for name in color
         }
         until(lambda: shown["left"]().sum() > 2000 and shown["right"]().sum() > 2000, 90)
+        until(lambda: [screen.sends_pictures for screen in served._screens.values()] == [sent == "pictures"])
         places = {name: np.argwhere(shown[name]()[:, :450]).mean(axis=0) for name in color}
 
         window.locator("form input").fill("right")

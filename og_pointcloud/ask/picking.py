@@ -45,6 +45,17 @@ _NOTHING_PICKED = {
 
 
 @dataclass(frozen=True, eq=False)
+class DrawnPoints:
+    """Points that a cloud's own stand back for. xyz: (n, 3), world = xyz + origin. spacing: typical distance between
+    neighbors. reach: how thick a surface is, in the scene's unit."""
+
+    xyz: NDArray[np.float32]
+    origin: NDArray[np.float64]
+    spacing: float
+    reach: float
+
+
+@dataclass(frozen=True, eq=False)
 class Pick:
     """What a click hit.
 
@@ -147,7 +158,7 @@ def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
     return in_local_frame(camera, -np.asarray(origin, np.float64))
 
 
-def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
+def front_points(cloud: LabelledCloud | DrawnPoints, camera: Camera) -> NDArray[np.int64]:
     """(H, W) index of the point that each pixel shows, NO_POINT (-1) where there is none.
 
     camera: maps from world coordinates.
@@ -197,7 +208,7 @@ class _Squares:
     half: NDArray[np.int64]
 
 
-def _squares(cloud: LabelledCloud, camera: Camera) -> tuple[_Squares, Camera]:
+def _squares(cloud: LabelledCloud | DrawnPoints, camera: Camera) -> tuple[_Squares, Camera]:
     """The squares that may touch the image, and the camera that they are drawn by, coarser for a coarse cloud."""
     uv_px, depth = in_world(camera, -cloud.origin).project(cloud.xyz.astype(np.float64))
     before = depth > NEAR * cloud.spacing

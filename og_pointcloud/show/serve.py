@@ -17,17 +17,14 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
-from viser.transforms import SO3
 
 from og_pointcloud.ask.boxes import unit_up
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.show.live import Answer, LiveScene
+from og_pointcloud.show.screen import Screen
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
 LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
-POINT_SIZE = 0.95
-"""Radius of a point in spacings: large enough that surfaces look closed."""
 HEIGHT_PX = 640
 """Height of the page in a notebook."""
 LISTED = 300
@@ -98,8 +95,11 @@ class LivePage:
         self._server.gui.main_panel.dock_right()
         self._server.scene.set_up_direction(settings.up)
         self._server.scene.on_click()(self._clicked)
+        self._screens: dict[int, Screen] = {}
         self._add_controls()
         self._show_scene()
+        self._server.on_client_connect(self._came)
+        self._server.on_client_disconnect(self._left)
 
     @property
     def url(self) -> str:
@@ -123,6 +123,8 @@ class LivePage:
 
     def stop(self) -> None:
         """End the page; browsers say that it is gone."""
+        for screen in self._screens.values():
+            screen.close()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -209,7 +211,7 @@ class LivePage:
         """Put the scene's points, camera and lists into the page."""
         live = self._live
         low, high = live.xyz.min(axis=0), live.xyz.max(axis=0)
-        self._middle = low + (high - low) / 2  # the page's origin: browsers draw in float32
+        self._middle = low + (high - low) / 2  # the page's origin
         view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, unit_up(self._settings.up))
         camera = self._server.initial_camera
         camera.fov, camera.up = 2 * float(np.arctan(1 / FOCAL)), view.up
@@ -218,7 +220,8 @@ class LivePage:
         camera.near, camera.far = extent / 1e4, 10 * extent
         for client in self._server.get_clients().values():
             client.camera.position, client.camera.look_at = camera.position, camera.look_at
-        self._points = self._add_points((live.xyz - self._middle).astype(np.float32))
+        for screen in self._screens.values():
+            screen.show(live, self._middle, self._size.value)
         self._mode.options, self._mode.value = live.modes, live.mode
         rows = [row for row in live.instances.largest(LISTED) if row.points]
         self._list.options = (EVERYTHING, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
@@ -226,28 +229,24 @@ class LivePage:
         self._legend.content = legend_html(live)
         self._tell(live.ask(""))
 
-    def _add_points(self, xyz: NDArray[np.float32]) -> Any:
-        """The points as splats where they are Gaussians, else as discs."""
-        live, scene = self._live, self._server.scene
-        shown = live.shown
-        if shown is None or shown.scale is None or shown.rotation is None or shown.opacity is None:
-            radius = POINT_SIZE * self._size.value * live.scene.cloud.spacing
-            return scene.add_point_cloud(
-                "/scene", xyz, live.colors(), point_size=radius, point_shape="circle", precision="float32",
-                point_shading="flat",
-            )  # fmt: skip
-        # Covariance R S S R' of each splat, S its standard deviations along its axes (3DGS).
-        axes = SO3(shown.rotation).as_matrix() * shown.scale[:, None, :]
-        covariances = axes @ axes.transpose(0, 2, 1)
-        return scene.add_gaussian_splats("/scene", xyz, covariances, live.colors() / 255, shown.opacity[:, None])
+    def _came(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            screen = self._screens[client.client_id] = Screen(client)
+            screen.show(self._live, self._middle, self._size.value)
+
+    def _left(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            if screen := self._screens.pop(client.client_id, None):
+                screen.close()
 
     def _resize(self) -> None:
-        if hasattr(self._points, "point_size"):
-            self._points.point_size = POINT_SIZE * self._size.value * self._live.scene.cloud.spacing
+        for screen in self._screens.values():
+            screen.resize(self._size.value)
 
     def _paint(self) -> None:
-        attribute = "colors" if hasattr(self._points, "colors") else "rgbs"
-        setattr(self._points, attribute, self._live.colors())
+        colors = self._live.colors()
+        for screen in self._screens.values():
+            screen.paint(colors)
 
     def _tell(self, answer: Answer) -> None:
         """The answer first, by itself: a browser shows that at once, and colors with the next frame that it draws."""

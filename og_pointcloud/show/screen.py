@@ -1,0 +1,192 @@
+"""What one browser shows of a live page: points that it draws, or pictures of them where it draws points slowly.
+
+Without a GPU a browser takes half a second to draw 300,000 points, whatever changed of them. Once it is known here
+which point each pixel shows, another picture of the same view is a look-up, and a word lights its points in a tenth of
+a second. So every browser is timed when it gets a cloud, and a slow one is sent pictures: of some of the points while
+the view turns, of all when it rests.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from og_pointcloud.ask.picking import DrawnPoints, front_points
+from og_pointcloud.formats.poses import rigid
+from og_pointcloud.scene import Camera
+from og_pointcloud.show.live import LiveScene
+
+POINT_SIZE = 0.95
+"""Radius of a point in spacings: large enough that surfaces look closed."""
+SLOW_S = 0.15
+"""A browser is slow where points add more to the seconds of a picture that it is asked for, two frames each."""
+PROBES, PROBE_PX, PROBE_S = 3, (48, 64), 20.0
+"""Pictures that are asked for, of which the quickest counts; their height and width; and how long each is waited for:
+a page that nobody sees draws none."""
+TURNING_POINTS = 30_000
+"""Points, about, of a picture while the view turns."""
+REST_S = 0.25
+"""Seconds without a turn until all points are drawn."""
+QUALITY = 92
+"""Of pictures as JPEG."""
+PAPER = np.full((1, 3), 255, np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A scene on show. xyz: (N, 3) in the page's frame. size: of points, as a factor."""
+
+    live: LiveScene
+    xyz: NDArray[np.float32]
+    size: float
+
+    @property
+    def spacing(self) -> float:
+        """That points are drawn by."""
+        return self.live.scene.cloud.spacing * self.size
+
+    def every(self, step: int) -> DrawnPoints:
+        """One point in so many, and as much larger."""
+        spacing = self.spacing * step**0.5
+        return DrawnPoints(self.xyz[::step], np.zeros(3), spacing, self.live.scene.cloud.reach)
+
+
+class Screen:
+    """A browser's view of a scene. client: viser's, which it is of."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._lock = threading.RLock()  # of what follows: the page, the timing and the turning of a view are threads
+        self._shown: _Shown | None = None
+        self._node: Any = None
+        self._colors = PAPER
+        self._front: NDArray[np.int64] | None = None
+        self.sends_pictures, self._open, self._turned = False, True, threading.Event()
+        client.camera.on_update(lambda _: self._turned.set())
+        threading.Thread(target=self._follow, daemon=True).start()
+
+    def show(self, live: LiveScene, middle: NDArray[np.float64], size: float) -> None:
+        """Show the points of a scene. middle: (3,) its place that is the page's origin. size: of points, 1 is usual."""
+        with self._lock:
+            xyz = (live.xyz - middle).astype(np.float32)  # browsers draw in float32
+            shown = self._shown = _Shown(live, xyz, size)
+            self.sends_pictures, self._front, self._colors = False, None, live.colors()
+            self._client.scene.set_background_image(None)
+            self._node = _add_points(self._client.scene, shown)
+        threading.Thread(target=self._time, args=[shown], daemon=True).start()
+
+    def paint(self, colors: NDArray[np.uint8]) -> None:
+        """Color the points. colors: (N, 3) uint8."""
+        with self._lock:
+            self._colors = colors
+            if self.sends_pictures:
+                self._send()
+            elif hasattr(self._node, "colors"):
+                self._node.colors = colors
+            else:
+                self._node.rgbs = colors
+
+    def resize(self, size: float) -> None:
+        """Draw points so many times as large as usual."""
+        with self._lock:
+            if self._shown is None:
+                return
+            self._shown = replace(self._shown, size=size)
+            if hasattr(self._node, "point_size"):
+                self._node.point_size = POINT_SIZE * self._shown.spacing
+        self._turned.set()
+
+    def close(self) -> None:
+        """The browser has left."""
+        self._open = False
+        self._turned.set()
+
+    # Pictures -------------------------------------------------------------------------------------------------------
+
+    def _time(self, shown: _Shown) -> None:
+        """Go on with pictures where the browser draws these points slowly."""
+        try:
+            both = self._probe()
+            if both > SLOW_S:  # by the points, not by the way there and back
+                self._node.visible = False
+                both -= self._probe()
+        except (RuntimeError, TimeoutError):  # it left, or nobody looks at it
+            both = 0.0
+        with self._lock:
+            if shown.live is not (self._shown and self._shown.live):
+                return  # another scene is on show by now
+            self.sends_pictures = both > SLOW_S
+            self._node.visible = not self.sends_pictures
+        self._turned.set()
+
+    def _probe(self) -> float:
+        """Seconds until a small picture is here."""
+        seconds = []
+        for _ in range(PROBES):
+            start = time.monotonic()
+            self._client.get_render(*PROBE_PX, timeout=PROBE_S)
+            seconds.append(time.monotonic() - start)
+        return min(seconds)
+
+    def _follow(self) -> None:
+        """Draw what a slow browser's camera sees, whenever it was turned."""
+        while self._turned.wait() and self._open:
+            self._turned.clear()
+            shown = self._shown
+            if not self.sends_pictures or shown is None:
+                continue
+            step = 1 + len(shown.xyz) // TURNING_POINTS
+            self._draw(shown, step)
+            if step > 1 and not self._turned.wait(REST_S):
+                self._draw(shown, 1)
+
+    def _draw(self, shown: _Shown, step: int) -> None:
+        """Find which point each pixel shows, of one in so many, and send the picture."""
+        camera = self._camera()
+        if camera is None:
+            return
+        front = front_points(shown.every(step), camera)
+        front[front >= 0] *= step
+        with self._lock:
+            if self.sends_pictures and shown is self._shown:
+                self._front = front
+                self._send()
+
+    def _camera(self) -> Camera | None:
+        """The browser's camera; None while its window has no size."""
+        camera = self._client.camera
+        width, height = camera.image_width, camera.image_height
+        if not width or not height:
+            return None
+        rotation = SO3(np.asarray(camera.wxyz, np.float64)).as_matrix().T
+        pose = rigid(rotation, -rotation @ np.asarray(camera.position, np.float64))
+        focal_px = height / 2 / np.tan(camera.fov / 2)
+        return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
+
+    def _send(self) -> None:
+        """The picture of the view in today's colors."""
+        if self._front is not None and self._open:
+            picture = np.concatenate([self._colors, PAPER])[self._front]  # NO_POINT, -1, reads the paper
+            self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
+            self._client.flush()
+
+
+def _add_points(scene: viser.SceneApi, shown: _Shown) -> Any:
+    """The points as splats where they are Gaussians, else as discs."""
+    live, splats = shown.live, shown.live.shown
+    if splats is None or splats.scale is None or splats.rotation is None or splats.opacity is None:
+        return scene.add_point_cloud(
+            "/scene", shown.xyz, live.colors(), point_size=POINT_SIZE * shown.spacing, point_shape="circle",
+            precision="float32", point_shading="flat",
+        )  # fmt: skip
+    # Covariance R S S R' of each splat, S its standard deviations along its axes (3DGS).
+    axes = SO3(splats.rotation).as_matrix() * splats.scale[:, None, :]
+    covariances = axes @ axes.transpose(0, 2, 1)
+    return scene.add_gaussian_splats("/scene", shown.xyz, covariances, live.colors() / 255, splats.opacity[:, None])
