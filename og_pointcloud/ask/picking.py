@@ -46,7 +46,7 @@ _NOTHING_PICKED = {
 
 @dataclass(frozen=True, eq=False)
 class DrawnPoints:
-    """Points that a cloud's own stand back for. xyz: (n, 3), world = xyz + origin. spacing: typical distance between
+    """Points to draw that are no LabelledCloud's. xyz: (n, 3), world = xyz + origin. spacing: typical distance between
     neighbors. reach: how thick a surface is, in the scene's unit."""
 
     xyz: NDArray[np.float32]
