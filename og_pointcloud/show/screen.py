@@ -76,11 +76,11 @@ class Screen:
         """Show the points of a scene. middle: (3,) its place that is the page's origin. size: of points, 1 is usual."""
         with self._lock:
             xyz = (live.xyz - middle).astype(np.float32)  # browsers draw in float32
-            shown = self._shown = _Shown(live, xyz, size)
+            self._shown = _Shown(live, xyz, size)
             self.sends_pictures, self._front, self._colors = False, None, live.colors()
             self._client.scene.set_background_image(None)
-            self._node = _add_points(self._client.scene, shown)
-        threading.Thread(target=self._time, args=[shown], daemon=True).start()
+            self._node = _add_points(self._client.scene, self._shown)
+        threading.Thread(target=self._time, args=[live], daemon=True).start()
 
     def paint(self, colors: NDArray[np.uint8]) -> None:
         """Color the points. colors: (N, 3) uint8."""
@@ -110,20 +110,22 @@ class Screen:
 
     # Pictures -------------------------------------------------------------------------------------------------------
 
-    def _time(self, shown: _Shown) -> None:
+    def _time(self, live: LiveScene) -> None:
         """Go on with pictures where the browser draws these points slowly."""
         try:
-            both = self._probe()
-            if both > SLOW_S:  # by the points, not by the way there and back
-                self._node.visible = False
-                both -= self._probe()
+            by_points = self._probe()
+            if by_points > SLOW_S:  # by the points, not by the way there and back
+                self._switch(live, points=False)
+                by_points -= self._probe()
         except (RuntimeError, TimeoutError):  # it left, or nobody looks at it
-            both = 0.0
+            by_points = 0.0
+        self._switch(live, points=by_points <= SLOW_S, pictures=by_points > SLOW_S)
+
+    def _switch(self, live: LiveScene, *, points: bool, pictures: bool = False) -> None:
+        """Show points, pictures or neither, unless another scene is on show by now."""
         with self._lock:
-            if shown.live is not (self._shown and self._shown.live):
-                return  # another scene is on show by now
-            self.sends_pictures = both > SLOW_S
-            self._node.visible = not self.sends_pictures
+            if self._shown is not None and self._shown.live is live:
+                self._node.visible, self.sends_pictures = points, pictures
         self._turned.set()
 
     def _probe(self) -> float:

@@ -123,7 +123,7 @@ class LivePage:
 
     def stop(self) -> None:
         """End the page; browsers say that it is gone."""
-        for screen in self._screens.values():
+        for screen in list(self._screens.values()):
             screen.close()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
