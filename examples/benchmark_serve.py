@@ -5,13 +5,14 @@
 
 The cloud shown is points of the scene's own, moved by noise. answer: the word is looked up, instances are chosen and
 points colored, in Python: on the clock, and of one core. told: from the key to the answer beside the picture,
-which no frame holds up. lit: to the first frame that looks another way; without a GPU nearly all of it is drawing. Both
+which no frame holds up. lit: to the first frame of the browser's screencast that looks another way. Both
 need playwright and a Chromium.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import shutil
 import sys
 import time
@@ -21,8 +22,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import imageio.v3
 import numpy as np
 from benchmark_runtime import make_frame
+from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.scene import Points
@@ -32,43 +35,26 @@ BROWSER = [
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking",
 ]  # fmt: skip
 WINDOW = {"width": 1100, "height": 700}
-KEPT = """
-const original = HTMLCanvasElement.prototype.getContext
-HTMLCanvasElement.prototype.getContext = function (kind, options) {
-  const context = original.call(this, kind, { ...options, preserveDrawingBuffer: true })
-  if (kind === "webgl2") window.pen = context
-  return context }
-window.draws = 0
-for (const name of ["drawArrays", "drawElements"]) {
-  const draw = WebGL2RenderingContext.prototype[name]
-  WebGL2RenderingContext.prototype[name] = function (...values) { window.draws += 1; draw.apply(this, values) } }
-"""
-"""What is drawn can be read at any time, and draws are counted."""
+WATCHED_MS = 2000
 WATCH = """
 () => {
-  const box = document.querySelector("form input"), pen = window.pen
-  const row = new Uint8Array(4 * pen.drawingBufferWidth)
-  const seen = () => {
-    pen.readPixels(0, pen.drawingBufferHeight >> 1, pen.drawingBufferWidth, 1, pen.RGBA, pen.UNSIGNED_BYTE, row)
-    return row.join() }
-  const before = seen()
-  window.lit = window.told = 0
+  const box = document.querySelector("form input"), now = () => performance.timeOrigin + performance.now()
+  window.told = 0
   box.addEventListener("input", () => {
-    const start = performance.now(), since = () => performance.now() - start
+    window.start = now()
     const changed = { childList: true, characterData: true, subtree: true }
     new MutationObserver((_, observer) => {
       if (![...document.querySelectorAll("b")].some((title) => title.textContent === box.value)) return
-      window.told = since()
+      window.told = now()
       observer.disconnect()
     }).observe(document.body, changed)
-    let drawn = window.draws
-    const look = () => {
-      // To read waits for the frame: only where there is a new one, and the answer was not held up by it.
-      if (window.told && window.draws !== drawn) { drawn = window.draws; if (seen() !== before) window.lit = since() }
-      if (!window.lit) requestAnimationFrame(look) }
-    requestAnimationFrame(look)
   }, { once: true })
 }"""
+"""Notes when a key came and when its answer was there, in milliseconds since 1970."""
+LOOKED_AT = 0.5
+"""Of the window's width, from the left: the points, without the panel."""
+ANOTHER = 4.0
+"""Mean difference of the values of pixels, 0 to 255, of a frame that looks another way: more than JPEG's error."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -132,7 +118,6 @@ def opened(chromium: Any, executable: str, live: LiveScene) -> Iterator[Any]:
     browser = chromium.launch(executable_path=executable, args=BROWSER)
     try:
         page = browser.new_page(viewport=WINDOW)
-        page.add_init_script(KEPT)
         page.goto(served.url)
         page.wait_for_selector("form input", timeout=60_000)
         time.sleep(8)
@@ -143,13 +128,40 @@ def opened(chromium: Any, executable: str, live: LiveScene) -> Iterator[Any]:
 
 
 def browser_seconds(page: Any, word: str) -> tuple[float, float]:
-    """From the key to the answer, and to another picture. Everything is lit before."""
+    """From the key to the answer, and to the first frame that looks another way. Everything is lit before."""
     page.locator("form input").fill("")
-    time.sleep(3)
+    page.wait_for_timeout(3000)
+    frames = frames_of(page, word)
+    start, told = page.evaluate("window.start") / 1e3, page.evaluate("window.told") / 1e3
+    before = [picture for second, picture in frames if second < start][-1]
+    lit = [second for second, picture in frames if second > start and np.abs(picture - before).mean() > ANOTHER]
+    if not lit or not told:
+        raise SystemExit(f"'{word}' lit nothing in {WATCHED_MS / 1e3:.0f} s; expected an instance that it fits")
+    return told - start, lit[0] - start
+
+
+def frames_of(page: Any, word: str) -> list[tuple[float, NDArray[np.int16]]]:
+    """Type a word: each frame of the browser from a second before, when it was shown in seconds since 1970, and its
+    pixels beside the panel."""
+    frames: list[tuple[float, str]] = []
+    cast = page.context.new_cdp_session(page)
+
+    def keep(frame: dict[str, Any]) -> None:
+        frames.append((frame["metadata"]["timestamp"], frame["data"]))
+        cast.send("Page.screencastFrameAck", {"sessionId": frame["sessionId"]})
+
+    cast.on("Page.screencastFrame", keep)
+    cast.send("Page.startScreencast", {"format": "jpeg", "quality": 80, "maxWidth": 550, "maxHeight": 350})
+    page.wait_for_timeout(1000)
     page.evaluate(WATCH)
     page.locator("form input").fill(word)
-    page.wait_for_function("window.lit && window.told", timeout=60_000)
-    return page.evaluate("window.told") / 1e3, page.evaluate("window.lit") / 1e3
+    page.wait_for_timeout(WATCHED_MS)
+    cast.send("Page.stopScreencast")
+    cast.detach()
+    pictures = [imageio.v3.imread(base64.b64decode(data)).astype(np.int16) for _, data in frames]
+    return [
+        (second, each[:, : int(LOOKED_AT * each.shape[1])]) for (second, _), each in zip(frames, pictures, strict=True)
+    ]
 
 
 if __name__ == "__main__":

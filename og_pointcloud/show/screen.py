@@ -8,11 +8,13 @@ the view turns, of all when it rests.
 
 from __future__ import annotations
 
+import base64
 import threading
 import time
 from dataclasses import dataclass, replace
 from typing import Any
 
+import imageio.v3
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -37,6 +39,9 @@ REST_S = 0.25
 QUALITY = 92
 """Of pictures as JPEG."""
 PAPER = np.full((1, 3), 255, np.uint8)
+BEHIND = "<style>canvas{{background:url(data:image/jpeg;base64,{}) 0 0/100% 100% no-repeat}}</style>"
+"""A picture behind the canvas, which is clear where it shows no points. A background that the canvas itself draws takes
+two or three more of a slow browser's frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +73,7 @@ class Screen:
         self._node: Any = None
         self._colors = PAPER
         self._front: NDArray[np.int64] | None = None
+        self._behind = client.gui.add_html("")
         self.sends_pictures, self._open, self._turned = False, True, threading.Event()
         client.camera.on_update(lambda _: self._turned.set())
         threading.Thread(target=self._follow, daemon=True).start()
@@ -78,7 +84,7 @@ class Screen:
             xyz = (live.xyz - middle).astype(np.float32)  # browsers draw in float32
             self._shown = _Shown(live, xyz, size)
             self.sends_pictures, self._front, self._colors = False, None, live.colors()
-            self._client.scene.set_background_image(None)
+            self._behind.content = ""
             self._node = _add_points(self._client.scene, self._shown)
         threading.Thread(target=self._time, args=[live], daemon=True).start()
 
@@ -102,6 +108,13 @@ class Screen:
             if hasattr(self._node, "point_size"):
                 self._node.point_size = POINT_SIZE * self._shown.spacing
         self._turned.set()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(H, W, 3 or 4) uint8: what the browser shows. Not to be called with the page's lock: it may have to draw."""
+        with self._lock:
+            if self.sends_pictures and self._front is not None:
+                return self._colored(self._front)
+        return self._client.get_render(self._client.camera.image_height, self._client.camera.image_width)
 
     def close(self) -> None:
         """The browser has left."""
@@ -175,9 +188,13 @@ class Screen:
     def _send(self) -> None:
         """The picture of the view in today's colors."""
         if self._front is not None and self._open:
-            picture = np.concatenate([self._colors, PAPER])[self._front]  # NO_POINT, -1, reads the paper
-            self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
+            picture = imageio.v3.imwrite("<bytes>", self._colored(self._front), extension=".jpg", quality=QUALITY)
+            self._behind.content = BEHIND.format(base64.b64encode(picture).decode())
             self._client.flush()
+
+    def _colored(self, front: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8: the points that the pixels show, in today's colors."""
+        return np.concatenate([self._colors, PAPER])[front]  # NO_POINT, -1, reads the paper
 
 
 def _add_points(scene: viser.SceneApi, shown: _Shown) -> Any:

@@ -199,9 +199,9 @@ class LivePage:
         import imageio.v3
 
         client = event.client
-        if client is None:
+        if client is None or client.client_id not in self._screens:
             return
-        picture = client.get_render(client.camera.image_height, client.camera.image_width)
+        picture = self._screens[client.client_id].picture()
         file = imageio.v3.imwrite("<bytes>", picture, extension=".png")
         client.send_file_download(f"{TITLE}.png", file, save_immediately=True)
 
