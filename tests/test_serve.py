@@ -211,6 +211,9 @@ class Browser:
         self.drawn = SimpleNamespace(colors=colors, visible=True)
         return self.drawn
 
+    def set_background_image(self, picture, *_, **__):
+        self.background = picture
+
     def add_html(self, content):
         return self
 
@@ -268,6 +271,7 @@ def test_a_browser_that_draws_points_slowly_is_sent_pictures(shown_in, with_poin
         until(lambda: browser.html)
     else:
         assert browser.html == ""
+        assert browser.background is None
 
 
 def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
@@ -279,6 +283,7 @@ def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
         live.ask(word)
         screen.paint(live.colors())
         assert np.array_equal(screen.picture(), np.append(live.colors(), [[255] * 3], axis=0)[front])
+        assert np.array_equal(browser.background, screen.picture())  # which a folded panel leaves
     error = [np.abs(sent.astype(int) - screen.picture()).mean() for sent in browser.pictures[-2:]]
     assert error[1] < 0.5 * error[0]  # JPEG's, and another word's
     screen.resize(2.0)

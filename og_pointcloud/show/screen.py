@@ -39,9 +39,12 @@ REST_S = 0.25
 QUALITY = 92
 """Of pictures as JPEG."""
 PAPER = np.full((1, 3), 255, np.uint8)
-BEHIND = "<style>canvas{{background:url(data:image/jpeg;base64,{}) 0 0/100% 100% no-repeat}}</style>"
-"""A picture behind the canvas, which is clear where it shows no points. A background that the canvas itself draws takes
-two or three more of a slow browser's frames."""
+OVER = (
+    "<style>div:has(> canvas[data-engine])::after{{content:'';position:absolute;inset:0;pointer-events:none;"
+    "background:url(data:image/jpeg;base64,{}) 0 0/100% 100%}}</style>"
+)
+"""A picture over the canvas. The background that the canvas itself draws is two or three of a slow browser's frames
+later, and is what stands there while the panel, which holds this, is folded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,7 @@ class Screen:
         self._node: Any = None
         self._colors = PAPER
         self._front: NDArray[np.int64] | None = None
-        self._behind = client.gui.add_html("")
+        self._over = client.gui.add_html("")
         self.sends_pictures, self._open, self._turned = False, True, threading.Event()
         client.camera.on_update(lambda _: self._turned.set())
         threading.Thread(target=self._follow, daemon=True).start()
@@ -84,7 +87,8 @@ class Screen:
             xyz = (live.xyz - middle).astype(np.float32)  # browsers draw in float32
             self._shown = _Shown(live, xyz, size)
             self.sends_pictures, self._front, self._colors = False, None, live.colors()
-            self._behind.content = ""
+            self._over.content = ""
+            self._client.scene.set_background_image(None)
             self._node = _add_points(self._client.scene, self._shown)
         threading.Thread(target=self._time, args=[live], daemon=True).start()
 
@@ -188,8 +192,11 @@ class Screen:
     def _send(self) -> None:
         """The picture of the view in today's colors."""
         if self._front is not None and self._open:
-            picture = imageio.v3.imwrite("<bytes>", self._colored(self._front), extension=".jpg", quality=QUALITY)
-            self._behind.content = BEHIND.format(base64.b64encode(picture).decode())
+            picture = self._colored(self._front)
+            file = imageio.v3.imwrite("<bytes>", picture, extension=".jpg", quality=QUALITY)
+            self._over.content = OVER.format(base64.b64encode(file).decode())
+            self._client.flush()
+            self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
             self._client.flush()
 
     def _colored(self, front: NDArray[np.int64]) -> NDArray[np.uint8]:
