@@ -156,8 +156,8 @@ def frames_of(page: Any, word: str) -> list[tuple[float, NDArray[np.int16]]]:
     page.evaluate(WATCH)
     page.locator("form input").fill(word)
     page.wait_for_timeout(WATCHED_MS)
+    cast.remove_listener("Page.screencastFrame", keep)
     cast.send("Page.stopScreencast")
-    cast.detach()
     pictures = [imageio.v3.imread(base64.b64decode(data)).astype(np.int16) for _, data in frames]
     return [
         (second, each[:, : int(LOOKED_AT * each.shape[1])]) for (second, _), each in zip(frames, pictures, strict=True)
