@@ -4,9 +4,9 @@
     python examples/benchmark_serve.py SCENE.ogpc --points 1000000
 
 The cloud shown is points of the scene's own, moved by noise. answer: the word is looked up, instances are chosen and
-points colored, in Python: on the clock, and of one core. told: from the key to the answer beside the picture,
-which no frame holds up. lit: to the first frame of the browser's screencast that looks another way. Both
-need playwright and a Chromium.
+points colored, in Python: on the clock, and of one core. told: from the key to the answer in the panel, which comes
+with the picture where the browser draws slowly. lit: to the first frame of the browser's screencast that looks another
+way. Both need playwright and a Chromium.
 """
 
 from __future__ import annotations

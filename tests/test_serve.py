@@ -91,6 +91,21 @@ def test_an_answer_is_sent_before_colors_are_made(pages, monkeypatch):
     assert sent == [pages.answer_html(live.ask("plum")), "colors"]
 
 
+def test_beside_pictures_an_answer_waits_for_the_picture(pages, monkeypatch):
+    """Two frames of a slow browser would take twice the time."""
+    live, sent = LiveScene(og.LabelledScene.from_cloud(room(300))), []
+    page = pages.serve({"room": live}, pages.ServeSettings(port=0))
+    slow = SimpleNamespace(sends_pictures=True, paint=lambda colors: sent.append(page._answer.content), close=print)
+    try:
+        page._screens[0] = slow
+        before, page._word.value = page._answer.content, "plum"
+        monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
+        page._ask()
+    finally:
+        page.stop()
+    assert sent == [before, pages.answer_html(live.ask("plum"))]
+
+
 def test_a_notebook_shows_the_page_in_its_cell(pages):
     page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
     try:
@@ -283,7 +298,7 @@ def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
         live.ask(word)
         screen.paint(live.colors())
         assert np.array_equal(screen.picture(), np.append(live.colors(), [[255] * 3], axis=0)[front])
-        assert np.array_equal(browser.background, screen.picture())  # which a folded panel leaves
+        until(lambda: np.array_equal(browser.background, screen.picture()))  # which a folded panel leaves
     error = [np.abs(sent.astype(int) - screen.picture()).mean() for sent in browser.pictures[-2:]]
     assert error[1] < 0.5 * error[0]  # JPEG's, and another word's
     screen.resize(2.0)

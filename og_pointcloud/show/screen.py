@@ -36,6 +36,8 @@ TURNING_POINTS = 30_000
 """Points, about, of a picture while the view turns."""
 REST_S = 0.25
 """Seconds without a turn until all points are drawn."""
+BEHIND_S = 1.0
+"""Seconds without other colors until the canvas itself gets them: that keeps a slow browser busy for half of one."""
 QUALITY = 92
 """Of pictures as JPEG."""
 PAPER = np.full((1, 3), 255, np.uint8)
@@ -43,8 +45,8 @@ OVER = (
     "<style>div:has(> canvas[data-engine])::after{{content:'';position:absolute;inset:0;pointer-events:none;"
     "background:url(data:image/jpeg;base64,{}) 0 0/100% 100%}}</style>"
 )
-"""A picture over the canvas. The background that the canvas itself draws is two or three of a slow browser's frames
-later, and is what stands there while the panel, which holds this, is folded."""
+"""A picture over the canvas, which needs one frame of a slow browser. The background that the canvas itself draws is
+what stands there while the panel, which holds this, is folded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,7 @@ class Screen:
         self._node: Any = None
         self._colors = PAPER
         self._front: NDArray[np.int64] | None = None
+        self._behind = threading.Timer(BEHIND_S, lambda: None)
         self._over = client.gui.add_html("")
         self.sends_pictures, self._open, self._turned = False, True, threading.Event()
         client.camera.on_update(lambda _: self._turned.set())
@@ -88,6 +91,7 @@ class Screen:
             self._shown = _Shown(live, xyz, size)
             self.sends_pictures, self._front, self._colors = False, None, live.colors()
             self._over.content = ""
+            self._behind.cancel()
             self._client.scene.set_background_image(None)
             self._node = _add_points(self._client.scene, self._shown)
         threading.Thread(target=self._time, args=[live], daemon=True).start()
@@ -97,7 +101,7 @@ class Screen:
         with self._lock:
             self._colors = colors
             if self.sends_pictures:
-                self._send()
+                self._send(BEHIND_S)
             elif hasattr(self._node, "colors"):
                 self._node.colors = colors
             else:
@@ -189,19 +193,29 @@ class Screen:
         focal_px = height / 2 / np.tan(camera.fov / 2)
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
-    def _send(self) -> None:
-        """The picture of the view in today's colors."""
+    def _send(self, wait_s: float = 0.0) -> None:
+        """The picture of the view in today's colors. wait_s: until the canvas draws it too."""
         if self._front is not None and self._open:
             picture = self._colored(self._front)
             file = imageio.v3.imwrite("<bytes>", picture, extension=".jpg", quality=QUALITY)
             self._over.content = OVER.format(base64.b64encode(file).decode())
             self._client.flush()
-            self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
-            self._client.flush()
+            self._behind.cancel()
+            self._behind = threading.Timer(wait_s, self._put_behind, [picture])
+            self._behind.daemon = True
+            self._behind.start()
+
+    def _put_behind(self, picture: NDArray[np.uint8]) -> None:
+        """Have the canvas draw a picture, unless points are on show by now."""
+        with self._lock:
+            if self.sends_pictures and self._open:
+                self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
+                self._client.flush()
 
     def _colored(self, front: NDArray[np.int64]) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: the points that the pixels show, in today's colors."""
-        return np.concatenate([self._colors, PAPER])[front]  # NO_POINT, -1, reads the paper
+        palette = np.concatenate([self._colors, PAPER])
+        return palette.take(front, axis=0, mode="wrap")  # NO_POINT, -1, reads the paper
 
 
 def _add_points(scene: viser.SceneApi, shown: _Shown) -> Any:

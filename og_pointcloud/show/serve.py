@@ -249,10 +249,16 @@ class LivePage:
             screen.paint(colors)
 
     def _tell(self, answer: Answer) -> None:
-        """The answer first, by itself: a browser shows that at once, and colors with the next frame that it draws."""
+        """Show an answer and its colors. Beside points it goes first, by itself: a browser shows that at once, and
+        colors with the next frame that it draws. Beside pictures all goes together: another frame would hold them up.
+        """
+        together = any(screen.sends_pictures for screen in self._screens.values())
+        if together:
+            self._paint()
         self._answer.content = answer_html(answer)
         self._server.flush()
-        self._paint()
+        if not together:
+            self._paint()
 
 
 def answer_html(answer: Answer) -> str:
