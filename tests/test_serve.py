@@ -321,6 +321,66 @@ def test_while_the_view_turns_a_picture_is_of_fewer_points(shown_in, monkeypatch
     assert np.array_equal(drawn[0].xyz, live.xyz[::6].astype(np.float32))
 
 
+def test_a_timing_of_points_that_were_replaced_changes_nothing(pages, monkeypatch):
+    """The scene is changed and changed back while the first timing waits for the browser."""
+    from og_pointcloud.show.screen import PROBES, Screen
+
+    browser, timed, asked, hold = Browser(monkeypatch, 0.9, 0.1), threading.Semaphore(0), [], threading.Event()
+    monkeypatch.setattr(Screen, "_time", lambda *args, time=Screen._time: (time(*args), timed.release()))
+    render = browser.get_render
+
+    def get_render(*args, **options):
+        asked.append(args)
+        if len(asked) == 1:
+            assert hold.wait(60)
+        return render(*args, **options)
+
+    browser.get_render = get_render
+    first, other = (LiveScene(og.LabelledScene.from_cloud(room(300))) for _ in range(2))
+    screen = Screen(browser)
+    try:
+        screen.show(first, np.zeros(3), 1.0)
+        until(lambda: asked)
+        for live in (other, first):
+            screen.show(live, np.zeros(3), 1.0)
+        hold.set()
+        assert all(timed.acquire(timeout=60) for _ in range(3))
+        assert (screen.sends_pictures, browser.drawn.visible) == (True, False)
+        assert len(asked) == 1 + 2 * PROBES  # a picture for each timing at once would hold up the others
+    finally:
+        screen.close()
+
+
+def test_a_browser_that_leaves_while_it_is_timed_is_sent_nothing_more(shown_in, monkeypatch):
+    from og_pointcloud.show.screen import Screen
+
+    left = []
+
+    def leave(screen, node, probe=Screen._probe):
+        seconds = probe(screen, node)
+        if not node.visible:
+            screen.close()
+            left.append(screen)
+            raise RuntimeError("it left")
+        return seconds
+
+    monkeypatch.setattr(Screen, "_probe", leave)
+    _live, browser, screen = shown_in(0.9, 0.1)
+    assert left == [screen]
+    assert (screen.sends_pictures, browser.drawn.visible) == (False, False)
+
+
+def test_a_picture_that_comes_late_is_in_the_colors_of_now(shown_in):
+    live, browser, screen = shown_in(0.9, 0.1)
+    until(lambda: browser.pictures)
+    until(lambda: browser.background is not None)
+    late = screen._behind
+    live.ask("plum")
+    screen.paint(live.colors())
+    late.function(*late.args)  # it had fired, and waited for its turn
+    assert np.array_equal(browser.background, screen.picture())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", ["points", "pictures"])
 def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, window, monkeypatch, sent):

@@ -74,6 +74,7 @@ class Screen:
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
         self._lock = threading.RLock()  # of what follows: the page, the timing and the turning of a view are threads
+        self._timing = threading.Lock()  # two timings at once would hold each other up
         self._shown: _Shown | None = None
         self._node: Any = None
         self._colors = PAPER
@@ -94,7 +95,8 @@ class Screen:
             self._behind.cancel()
             self._client.scene.set_background_image(None)
             self._node = _add_points(self._client.scene, self._shown)
-        threading.Thread(target=self._time, args=[live], daemon=True).start()
+            timing = threading.Thread(target=self._time, args=[self._node], daemon=True)
+        timing.start()
 
     def paint(self, colors: NDArray[np.uint8]) -> None:
         """Color the points. colors: (N, 3) uint8."""
@@ -131,28 +133,32 @@ class Screen:
 
     # Pictures -------------------------------------------------------------------------------------------------------
 
-    def _time(self, live: LiveScene) -> None:
-        """Go on with pictures where the browser draws these points slowly."""
-        try:
-            by_points = self._probe()
-            if by_points > SLOW_S:  # by the points, not by the way there and back
-                self._switch(live, points=False)
-                by_points -= self._probe()
-        except (RuntimeError, TimeoutError):  # it left, or nobody looks at it
-            by_points = 0.0
-        self._switch(live, points=by_points <= SLOW_S, pictures=by_points > SLOW_S)
+    def _time(self, node: Any) -> None:
+        """Go on with pictures where the browser draws these points slowly. node: viser's, of the points."""
+        with self._timing:
+            try:
+                by_points = self._probe(node)
+                if by_points > SLOW_S:  # by the points, not by the way there and back
+                    self._switch(node, points=False)
+                    by_points -= self._probe(node)
+            except (RuntimeError, TimeoutError):  # it left, or nobody looks at it
+                by_points = 0.0
+            self._switch(node, points=by_points <= SLOW_S, pictures=by_points > SLOW_S)
 
-    def _switch(self, live: LiveScene, *, points: bool, pictures: bool = False) -> None:
-        """Show points, pictures or neither, unless another scene is on show by now."""
+    def _switch(self, node: Any, *, points: bool, pictures: bool = False) -> None:
+        """Show points, pictures or neither, unless others are on show by now, of the same scene perhaps, or nobody is
+        there: viser warns of what is sent then."""
         with self._lock:
-            if self._shown is not None and self._shown.live is live:
-                self._node.visible, self.sends_pictures = points, pictures
+            if self._open and self._node is node:
+                node.visible, self.sends_pictures = points, pictures
         self._turned.set()
 
-    def _probe(self) -> float:
-        """Seconds until a small picture is here."""
+    def _probe(self, node: Any) -> float:
+        """Seconds until a small picture is here; 0 once other points are on show, which are timed by themselves."""
         seconds = []
         for _ in range(PROBES):
+            if self._node is not node:
+                return 0.0
             start = time.monotonic()
             self._client.get_render(*PROBE_PX, timeout=PROBE_S)
             seconds.append(time.monotonic() - start)
@@ -201,15 +207,15 @@ class Screen:
             self._over.content = OVER.format(base64.b64encode(file).decode())
             self._client.flush()
             self._behind.cancel()
-            self._behind = threading.Timer(wait_s, self._put_behind, [picture])
+            self._behind = threading.Timer(wait_s, self._put_behind)
             self._behind.daemon = True
             self._behind.start()
 
-    def _put_behind(self, picture: NDArray[np.uint8]) -> None:
-        """Have the canvas draw a picture, unless points are on show by now."""
+    def _put_behind(self) -> None:
+        """Have the canvas draw the picture, as it is by now, unless points are on show: timers may fire late."""
         with self._lock:
-            if self.sends_pictures and self._open:
-                self._client.scene.set_background_image(picture, "jpeg", jpeg_quality=QUALITY)
+            if self.sends_pictures and self._open and self._front is not None:
+                self._client.scene.set_background_image(self._colored(self._front), "jpeg", jpeg_quality=QUALITY)
                 self._client.flush()
 
     def _colored(self, front: NDArray[np.int64]) -> NDArray[np.uint8]:
