@@ -106,6 +106,31 @@ def test_beside_pictures_an_answer_waits_for_the_picture(pages, monkeypatch):
     assert sent == [before, pages.answer_html(live.ask("plum"))]
 
 
+def test_a_browser_that_has_left_before_it_is_welcomed_gets_no_screen(pages):
+    """Both are told from threads, in any order; what is kept for it would never be let go."""
+    page = pages.serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, pages.ServeSettings(port=0))
+    try:
+        gone = SimpleNamespace(client_id=7)
+        page._left(gone)
+        page._came(gone)
+        assert page._screens == {}
+    finally:
+        page.stop()
+
+
+def test_an_instance_chosen_of_the_scene_before_lights_nothing(pages):
+    """One browser changes the scene while another chooses from its list."""
+    live = LiveScene(og.LabelledScene.from_cloud(room(300)))
+    page = pages.serve({"room": live}, pages.ServeSettings(port=0))
+    try:
+        for of_another_scene in ("1 · plum · 7", "1000 · plum · 7"):
+            page._list._impl.value = of_another_scene  # as viser sets what a browser sends
+            page._chosen()
+            assert live.lit is None
+    finally:
+        page.stop()
+
+
 def test_a_notebook_shows_the_page_in_its_cell(pages):
     page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
     try:

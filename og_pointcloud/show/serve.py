@@ -173,8 +173,10 @@ class LivePage:
         self._list.value = EVERYTHING
 
     def _chosen(self) -> None:
-        self._word.value = ""
         row = self._list.value
+        if row not in self._list.options:
+            return  # of a scene that another browser has just changed
+        self._word.value = ""
         self._tell(self._live.ask("") if row == EVERYTHING else self._live.choose(int(row.split(" ")[0])))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
@@ -231,6 +233,8 @@ class LivePage:
 
     def _came(self, client: viser.ClientHandle) -> None:
         with self._lock:
+            if client.client_id not in self._server.get_clients():
+                return  # it has left already, perhaps before this: both come from threads
             screen = self._screens[client.client_id] = Screen(client)
             screen.show(self._live, self._middle, self._size.value)
 
