@@ -251,6 +251,12 @@ class Browser:
         self.drawn = SimpleNamespace(colors=colors, visible=True)
         return self.drawn
 
+    def add_gaussian_splats(self, name, xyz, shapes, rgbs, opacities):
+        node = SimpleNamespace(rgbs=rgbs, visible=True)
+        node.remove = lambda: setattr(self, "drawn", None)  # while hidden ones are drawn at full cost
+        self.drawn = node
+        return node
+
     def set_background_image(self, picture, *_, **__):
         self.background = picture
 
@@ -268,7 +274,7 @@ class Browser:
             self.pictures.append(picture_of(base64.b64decode(html.split("base64,")[1].split(")")[0])))
 
     def get_render(self, height, width, timeout):
-        seconds = self.seconds[self.drawn.visible]
+        seconds = self.seconds[self.drawn is not None and (self.drawn.visible or hasattr(self.drawn, "rgbs"))]
         if seconds > timeout:
             raise TimeoutError
         self.clock += seconds
@@ -284,8 +290,9 @@ def shown_in(pages, monkeypatch):
 
     screens = []
 
-    def shown(with_points, without, count=300):
-        browser, live = Browser(monkeypatch, with_points, without), LiveScene(og.LabelledScene.from_cloud(room(count)))
+    def shown(with_points, without, count=300, points=None):
+        browser = Browser(monkeypatch, with_points, without)
+        live = LiveScene(og.LabelledScene.from_cloud(room(count)), points)
         timed = threading.Event()
         monkeypatch.setattr(Screen, "_time", lambda *args, time=Screen._time: (time(*args), timed.set()))
         screens.append(Screen(browser))
@@ -312,6 +319,22 @@ def test_a_browser_that_draws_points_slowly_is_sent_pictures(shown_in, with_poin
     else:
         assert browser.html == ""
         assert browser.background is None
+
+
+@pytest.mark.parametrize(("with_splats", "without", "slow"), [(0.02, 0.01, False), (0.9, 0.8, False), (0.9, 0.1, True)],
+                         ids=["quick", "far away", "slow"])  # fmt: skip
+def test_splats_that_a_browser_draws_slowly_leave_it(shown_in, with_splats, without, slow):
+    from test_formats_spz import splats
+
+    live, browser, screen = shown_in(with_splats, without, points=splats(300))
+    assert (screen.sends_pictures, browser.drawn is None) == (slow, slow)
+    live.ask("plum")
+    screen.paint(live.colors())
+    if slow:
+        until(lambda: browser.html)
+    else:
+        assert browser.drawn.visible
+        assert np.array_equal(browser.drawn.rgbs, live.colors())
 
 
 def test_a_picture_shows_the_points_as_they_are_colored(shown_in):

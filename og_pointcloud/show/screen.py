@@ -94,7 +94,7 @@ class Screen:
             self._over.content = ""
             self._behind.cancel()
             self._client.scene.set_background_image(None)
-            self._node = _add_points(self._client.scene, self._shown)
+            self._node = _add_points(self._client.scene, self._shown, self._colors)
             timing = threading.Thread(target=self._time, args=[self._node], daemon=True)
         timing.start()
 
@@ -106,7 +106,7 @@ class Screen:
                 self._send(BEHIND_S)
             elif hasattr(self._node, "colors"):
                 self._node.colors = colors
-            else:
+            elif self._node.visible:
                 self._node.rgbs = colors
 
     def resize(self, size: float) -> None:
@@ -149,8 +149,16 @@ class Screen:
         """Show points, pictures or neither, unless others are on show by now, of the same scene perhaps, or nobody is
         there: viser warns of what is sent then."""
         with self._lock:
-            if self._open and self._node is node:
-                node.visible, self.sends_pictures = points, pictures
+            if self._open and self._node is node and self._shown is not None:
+                self.sends_pictures = pictures
+                if hasattr(node, "colors"):
+                    node.visible = points
+                # Splats that are hidden take a browser as long as others: they have to go, and to come again.
+                elif node.visible and not points:
+                    node.visible = False
+                    node.remove()
+                elif points and not node.visible:
+                    self._node = _add_points(self._client.scene, self._shown, self._colors)
         self._turned.set()
 
     def _probe(self, node: Any) -> float:
@@ -224,15 +232,15 @@ class Screen:
         return palette.take(front, axis=0, mode="wrap")  # NO_POINT, -1, reads the paper
 
 
-def _add_points(scene: viser.SceneApi, shown: _Shown) -> Any:
+def _add_points(scene: viser.SceneApi, shown: _Shown, colors: NDArray[np.uint8]) -> Any:
     """The points as splats where they are Gaussians, else as discs."""
-    live, splats = shown.live, shown.live.shown
+    splats = shown.live.shown
     if splats is None or splats.scale is None or splats.rotation is None or splats.opacity is None:
         return scene.add_point_cloud(
-            "/scene", shown.xyz, live.colors(), point_size=POINT_SIZE * shown.spacing, point_shape="circle",
+            "/scene", shown.xyz, colors, point_size=POINT_SIZE * shown.spacing, point_shape="circle",
             precision="float32", point_shading="flat",
         )  # fmt: skip
     # Covariance R S S R' of each splat, S its standard deviations along its axes (3DGS).
     axes = SO3(splats.rotation).as_matrix() * splats.scale[:, None, :]
     covariances = axes @ axes.transpose(0, 2, 1)
-    return scene.add_gaussian_splats("/scene", shown.xyz, covariances, live.colors() / 255, splats.opacity[:, None])
+    return scene.add_gaussian_splats("/scene", shown.xyz, covariances, colors / 255, splats.opacity[:, None])
