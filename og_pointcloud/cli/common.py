@@ -39,10 +39,23 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Abbreviations would make `--mask` mean one thing today and another once an option is added.
         super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+        self.register("action", None, Once)
         self._negative_number_matcher = re.compile(r"-([\d.,-]+|[xyz])$")  # -1,2,3 and -z are values, no options
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
+
+
+class Once(argparse.Action):
+    """What an option does unless said otherwise: of several values argparse would take the last without a word."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        given = vars(namespace).setdefault("given", set())
+        if option_string and self.dest in given:
+            example = f": {option_string} {self.metavar}" if self.metavar else ""
+            parser.error(f"{option_string} is given twice; expected once{example}")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
 
 
 SHARED: dict[str, dict[str, Any]] = {

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, direction, print_result
 from og_pointcloud.cli.update import print_changes
+from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
@@ -25,6 +26,8 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.mapping.changes import compare
 
+    if arguments.up and not arguments.html:
+        raise OgPointcloudError(f"--up is '{arguments.up}' without --html; expected the page whose view it turns")
     before, after = load(arguments.before), load(arguments.after)
     changes = compare(before, after)
     if arguments.html:

@@ -33,6 +33,11 @@ def run(arguments: argparse.Namespace) -> None:
     uses_view = arguments.pixel is not None or arguments.output is not None
     if uses_view and not (arguments.capture and arguments.view):
         raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
+    if not uses_view and (arguments.capture or arguments.view):
+        given = "--capture" if arguments.capture else "--view"
+        raise OgPointcloudError(
+            f"{given} is given with --xyz alone, which needs no camera; expected -o MASK.png with it"
+        )
     scene = og.load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
     # A click is as good as the camera's pose: it is checked against the fitted cloud.

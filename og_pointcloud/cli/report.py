@@ -17,8 +17,9 @@ from og_pointcloud.errors import OgPointcloudError
 def add(parser: Parser) -> None:
     option = partial(add_option, parser)
     option("captures", "CAPTURE", "folders; without gt.npz the error is 1 - reliability", type=Path, nargs="+")
-    option("--knob", "NAME", "only this setting (may be given several times)", action="append")
-    parser.add_argument("--quick", action="store_true", help="only the settings that matter most")
+    few = parser.add_mutually_exclusive_group()
+    add_option(few, "--knob", "NAME", "only this setting (may be given several times)", action="append")
+    few.add_argument("--quick", action="store_true", help="only the settings that matter most")
     folder = "folder for report.md, .csv and .png (default: %(default)s)"
     parser.add_argument("-o", "--output", type=Path, default=Path("out/report"), metavar="DIR", help=folder)
 
