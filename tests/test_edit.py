@@ -107,7 +107,7 @@ def test_what_is_no_instance_is_refused(scene, splats, tmp_path, what):
 
 
 def test_a_click_that_missed_and_a_word_that_fits_nothing_are_refused(scene, splats, tmp_path):
-    with pytest.raises(OgPointcloudError, match="missed"):
+    with pytest.raises(OgPointcloudError, match="the click hit no point of the scene; expected an instance to edit"):
         og.edit.remove(scene, og.pick(scene, FAR + 500), tmp_path / "out.ply", cloud=splats)
     nothing = og.select(scene, {"moon": -scene.vocabulary.vectors.sum(axis=0)})
     assert not nothing.fitting
@@ -453,6 +453,8 @@ def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
     assert len(og.read_points(rest)) == (~chosen).sum()
     assert run("segment", bundle, "-o", tmp_path / "plain.spz") == 2
     assert "holds splats alone; expected those that were asked about (--points" in capsys.readouterr().err
+    assert run("edit", "extract", bundle, "--id", "2", "-o", tmp_path / "plain.spz") == 2
+    assert "plain.spz holds splats alone, the cloud has plain points" in capsys.readouterr().err
 
 
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):

@@ -160,6 +160,8 @@ class _Cloud:
         changed, elements, notes = int(self.chosen.sum()), {**self.elements, "vertex": rows}, self.notes
         if Path(output).suffix == ".spz":
             notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
+            if not holds_gaussians(elements):
+                raise SceneError(f"{output} holds splats alone, the cloud has plain points; expected .ply, or splats")
             write_spz(output, gaussians_from_ply(elements))
         else:
             write_ply(output, elements, [f"edited by og-pointcloud: {changed} points {verb}"])
@@ -199,6 +201,8 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
         raise OgPointcloudError(
             f"'{what.query}' fits none of {count} instances better than other words do: give its id"
         )
+    if isinstance(what, Pick) and not what.found:
+        raise OgPointcloudError(f"the click hit {what}; expected an instance to edit: click elsewhere")
     what = what.instances if isinstance(what, Selection) else what
     what = what.instance if isinstance(what, (Pick, Match)) else what
     ids = tuple(what) if isinstance(what, Iterable) else (what,)
