@@ -34,6 +34,16 @@ def coordinate(value: float) -> str:
     return f"{value:.1f}" if 1e3 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
+def counted(count: int, thing: str) -> str:
+    """So many things, to be read.
+
+    >>> from og_pointcloud.errors import counted
+    >>> counted(1, "scene"), counted(1200, "scene")
+    ('1 scene', '1,200 scenes')
+    """
+    return f"{count:,} {thing}{'' if count == 1 else 's'}"
+
+
 def span(points: NDArray[np.floating]) -> str:
     """The box of points (n, 3) to be read, from..to along x, y and z."""
     bounds = zip(points.min(axis=0), points.max(axis=0), strict=True)

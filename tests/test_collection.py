@@ -392,6 +392,12 @@ def test_commands(folder, capsys, tmp_path):
     assert "2 added" in out
     assert "2 scenes with 3 instances" in out
     assert "broken is left out" in err
+    (folder / "one").mkdir()
+    og.write_bundle(scene(["desk"], 1), folder / "one" / "room.ogpc")
+    assert "1 added, 0 unchanged: 1 scene with 1 instance in" in output_of(
+        capsys, "index", folder / "one", "-o", tmp_path / "one"
+    )
+    (folder / "one" / "room.ogpc").unlink()
     records = json.loads(output_of(capsys, "find", atlas, "mug", "--json", "--html", page))
     assert list(records[0]) == ["scene", "instance", "word", "score", "center", "size"]
     assert (records[0]["scene"], records[0]["instance"], records[0]["word"]) == ("room0", 1, "mug")

@@ -424,6 +424,8 @@ def test_commands(scene, splats, tmp_path, capsys):
         == len(scene.xyz)
         == record["points"] + np.isin(scene.instance_ids, [3, 5]).sum()
     )
+    assert edit("remove", bundle, "--id", "3,5", "--cloud", splats, "-o", out) == 0
+    assert "points removed (instances 3, 5)" in capsys.readouterr().out
     assert edit("extract", bundle, f"--xyz={place}", "--cloud", splats, "-o", tmp_path / "two.ply") == 0
     assert "points extracted (instance 2)" in capsys.readouterr().out
     assert edit("recolour", bundle, "--word", WORDS[1], "--color", "90,80,70", "-o", tmp_path / "c.ply") == 0

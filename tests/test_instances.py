@@ -14,6 +14,7 @@ from og_pointcloud.ask.boxes import axis_aligned_box, oriented_box
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import counted
 
 FAR = np.array([1e6, -4e6, 350.25])
 
@@ -31,7 +32,7 @@ def bundle(tmp_path_factory):
 @pytest.mark.parametrize("cloud", tough_clouds().values(), ids=tough_clouds())
 def test_every_cloud_has_a_table(cloud):
     table = og.instance_table(LabelledScene.from_cloud(cloud))
-    assert str(table).startswith(f"{len(cloud.instances)} instances")
+    assert str(table).startswith(counted(len(cloud.instances), "instance"))
     assert json.loads(table.to_json(), parse_constant=pytest.fail) == table.to_records(), "no NaN, no infinity"
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, oriented_boxes, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, coordinate, printable
+from og_pointcloud.errors import OgPointcloudError, coordinate, counted, printable
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.tables import csv_text
 
@@ -182,7 +182,7 @@ class Instances(Sequence[Instance]):
         lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
         if len(self) > len(shown):
             lines.append(f"and {len(self) - len(shown)} smaller ones")
-        return "\n".join([f"{len(self)} instances", *lines])
+        return "\n".join([counted(len(self), "instance"), *lines])
 
 
 def with_boxes(rows: Iterable[Instance]) -> list[Instance]:

@@ -27,7 +27,7 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, SceneError, span
+from og_pointcloud.errors import OgPointcloudError, SceneError, counted, span
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.scene import RIGID, DoubleArray, FloatArray, IntArray, float32_step, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
@@ -67,11 +67,11 @@ class LabelledScene:
         self.vocabulary, self.feature_space = cloud.vocabulary, cloud.feature_space
 
     def __repr__(self) -> str:
-        words = f"{len(self.vocabulary.names):,} words" if self.vocabulary else "no words of its own"
+        words = counted(len(self.vocabulary.names), "word") if self.vocabulary else "no words of its own"
         place = "in memory" if self.path is None else f"'{self.path}'"
         return (
-            f"LabelledScene({place}: {len(self.instance_ids):,} points, "
-            f"{len(self.cloud.instances):,} instances, {words}, feature space '{self.feature_space}')"
+            f"LabelledScene({place}: {counted(len(self.instance_ids), 'point')}, "
+            f"{counted(len(self.cloud.instances), 'instance')}, {words}, feature space '{self.feature_space}')"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

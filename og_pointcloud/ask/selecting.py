@@ -19,7 +19,7 @@ from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.text.words import Labels, TextFeatures
 
 
@@ -113,7 +113,7 @@ class Selection(Sequence[Match]):
         return json.dumps(record, indent=2, ensure_ascii=False)
 
     def __repr__(self) -> str:
-        lines = [f"'{self.query}' fits {len(self.fitting)} of {len(self)} instances"]
+        lines = [f"'{self.query}' fits {len(self.fitting)} of {counted(len(self), 'instance')}"]
         for match in self[:SHOWN]:
             mark = "*" if match.fits else " "
             rival = f"{match.rival} {match.rival_score:.3f}" if match.rival else "-"

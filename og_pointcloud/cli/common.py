@@ -19,7 +19,7 @@ from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, counted, printable
 from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
@@ -220,8 +220,8 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     total = report["points"]
     shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
     print(
-        f"{total:,} points: {shares[0]:.1%} in {report['instances']} instances, {shares[1]:.1%} background, "
-        f"{shares[2]:.1%} unobserved"
+        f"{counted(total, 'point')}: {shares[0]:.1%} in {counted(report['instances'], 'instance')}, "
+        f"{shares[1]:.1%} background, {shares[2]:.1%} unobserved"
     )
     if report["reliability"] is not None:
         print(f"reliability {report['reliability']:.2f}: how far half of the views bear the labels out, 0 to 1")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 
 if TYPE_CHECKING:
     from og_pointcloud.show.edit import What
@@ -70,8 +70,8 @@ def what_to_edit(arguments: argparse.Namespace) -> What:
 
 def print_edit(record: Mapping[str, Any]) -> None:
     """Print what was changed, what could not be kept, and the file."""
-    instances = ", ".join(map(str, record["instances"]))
-    print(f"{record['changed']:,} points {VERBS[record['operation']]} (instance {instances})")
+    instances = f"instance{'s' if len(record['instances']) > 1 else ''} {', '.join(map(str, record['instances']))}"
+    print(f"{counted(record['changed'], 'point')} {VERBS[record['operation']]} ({instances})")
     for note in record["notes"]:
         print(f"note: {note}")
-    print(f"wrote {record['output']} ({record['points']:,} points)")
+    print(f"wrote {record['output']} ({counted(record['points'], 'point')})")

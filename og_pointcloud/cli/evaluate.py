@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.formats.atomic import write_json
 
 if TYPE_CHECKING:
@@ -117,7 +117,8 @@ def run_scannet(arguments: argparse.Namespace) -> None:
     ]
     common.print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
     published = sum(scene in SCENES for scene in truths)
-    print(f"{len(truths)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
+    scenes = f"{counted(len(truths), 'scene')}, {published} of the {len(SCENES)} of the published table"
+    print(f"{scenes}; intervals are over scenes")
     if arguments.gaussians is None:
         print("no --gaussians: transparent points are not ignored")
     write_scores(arguments, {str(task): {**mean, "scenes": scores[task]} for task, mean in means.items()})
@@ -216,7 +217,9 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
     rows.append(("95 % over pairs", "", *(spread((found.low, found.high)) for found in intervals)))
     common.print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
-    print(f"{total} pairs of {len(scenes)} scenes; the published table has {PUBLISHED_PAIRS} of 4")
+    print(
+        f"{counted(total, 'pair')} of {counted(len(scenes), 'scene')}; the published table has {PUBLISHED_PAIRS} of 4"
+    )
     return {way: {"miou": miou, "accuracy": found} for way, (miou, found) in means.items()}
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, get_args, get_type_hints
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, counted, printable
 from og_pointcloud.formats.atomic import write_json
 from og_pointcloud.journal import Journal
 from og_pointcloud.settings import FitSettings, PaperSettings
@@ -86,7 +86,7 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
         cloud = fit_capture(capture, options, work=work, executor=executor, progress=True)
     except KeyboardInterrupt:
         if views := kept_files(work, "view"):
-            print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
+            print(f"kept in '{work}': {counted(views, 'view')}; the same command goes on behind them", file=sys.stderr)
         raise
     cloud = common.write_fit(cloud, Journal(False), arguments.output)
     if arguments.rerun:
@@ -116,7 +116,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     # What failed is told last, and ends in an error, so that a script sees it; what was fitted stays.
     failed = [fit for fit in fits if fit.state == "failed"]
     there = len(fits) - len(made) - len(failed)
-    print(f"{len(made)} fitted, {there} were there already, {len(failed)} failed, in {arguments.out}")
+    print(f"{len(made)} fitted, {there} there already, {len(failed)} failed, in {arguments.out}")
     for fit in made:
         if fit.doubts:
             doubts = ", ".join(fit.doubts)

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, print_next, replaceable
-from og_pointcloud.errors import printable
+from og_pointcloud.errors import counted, printable
 
 
 def add(parser: Parser) -> None:
@@ -28,8 +28,9 @@ def run(arguments: argparse.Namespace) -> None:
     assert changes is not None
     for name, cause in changes.left_out:
         print(f"warning: {printable(name, 200)} is left out: {cause}", file=sys.stderr)
-    instances = sum(entry.instances for entry in collection.entries)
-    print(f"{changes}: {len(collection.scenes):,} scenes with {instances:,} instances in {arguments.output}")
+    scenes = counted(len(collection.scenes), "scene")
+    instances = counted(sum(entry.instances for entry in collection.entries), "instance")
+    print(f"{changes}: {scenes} with {instances} in {arguments.output}")
     if arguments.lance:
         from og_pointcloud.collection.lance import write_lance
 

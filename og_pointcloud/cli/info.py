@@ -12,7 +12,7 @@ from typing import Any
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import BundleError, printable
+from og_pointcloud.errors import BundleError, counted, printable
 
 
 def add(parser: Parser) -> None:
@@ -44,10 +44,11 @@ def print_info(scene: og.LabelledScene, path: Path) -> None:
     words = cloud.vocabulary.names if cloud.vocabulary else ()
     writer = printable(str(manifest.get("written_by", "unknown writer")), 60)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {writer}")
-    print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
+    sizes = f"{counted(len(cloud), 'point')}, {counted(len(cloud.instances), 'instance')}"
+    print(f"{sizes}, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
-    print(f"{len(words)} words: {common.some_of(words)}" if words else "no words of its own")
+    print(f"{counted(len(words), 'word')}: {common.some_of(words)}" if words else "no words of its own")
     if cloud.word_bank is None:
         print(f"no word bank: scores are cosines. {common.calibration_hint(path)}\n")
     else:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from og_pointcloud.cli.common import SHOWN, Parser, add_option, add_output, add_shared, print_next, replaceable
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 
 
 def add(parser: Parser) -> None:
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"left out: {count} x {why}", file=sys.stderr)
     if rest := left_out[SHOWN:]:
         print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)
-    objects = mapper.objects()
-    print(f"{taken:,} frames, {mapper.points:,} points, {len(objects)} objects")
+    made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
+    print(", ".join(counted(count, thing) for count, thing in made))
     print(f"wrote {arguments.output}")
     print_next("info", arguments.output)

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next, some_of, warn_of_poses
+from og_pointcloud.errors import counted
 
 
 def add(parser: Parser) -> None:
@@ -60,7 +61,8 @@ def run(arguments: argparse.Namespace) -> None:
     if made.done_before == made.images:
         print(f"all {made.images} images have these masks already: nothing to do (--overwrite makes them again)")
     print(
-        f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
+        f"{counted(made.masks, 'mask')} in {counted(made.images, 'image')} ({made.seconds:.1f} s, {made.done_before} "
+        "done before), "
         f"feature space {made.feature_space}"
     )
     print_next("fit", made.output, "-o", f"{made.output.resolve().name}.ogpc")

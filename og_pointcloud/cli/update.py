@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, write_fit
+from og_pointcloud.errors import counted
 from og_pointcloud.formats.atomic import write_json
 from og_pointcloud.journal import Journal
 
@@ -43,7 +44,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         write_json(arguments.json, updated.changes.to_dict())
     print_changes(updated.changes)
-    print(f"wrote {arguments.output} ({len(updated.cloud):,} points, {len(updated.cloud.instances)} instances)")
+    sizes = f"{counted(len(updated.cloud), 'point')}, {counted(len(updated.cloud.instances), 'instance')}"
+    print(f"wrote {arguments.output} ({sizes})")
     print_next("compare", arguments.map, arguments.output, "--html", arguments.output.with_suffix(".html"))
 
 

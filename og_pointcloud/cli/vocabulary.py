@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_commands, add_option, add_output, replaceable
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 
 if TYPE_CHECKING:
     from og_pointcloud.text.encoder import TextEncoder
@@ -47,7 +47,7 @@ def run_add(arguments: argparse.Namespace) -> None:
         words, encoder = read_words(arguments.words), scene_encoder(arguments)
         vocabulary, space = og.Vocabulary(words, encoder(words)), encoder.feature_space
     together = add_words(arguments.bundle, vocabulary, space, arguments.output)
-    print(f"wrote {arguments.output or arguments.bundle}: {len(together.names)} words")
+    print(f"wrote {arguments.output or arguments.bundle}: {counted(len(together.names), 'word')}")
 
 
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:

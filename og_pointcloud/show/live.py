@@ -17,7 +17,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, coordinate, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, coordinate, counted, printable
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
@@ -191,7 +191,8 @@ class LiveScene:
             return Answer(f"“{printable(word, LONGEST_WORD)}”", (str(error),))
         # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
         self.lit = set(selection.instances)
-        fits = f"fits {len(self.lit)} of {len(selection)} instances" if self.lit else "fits no instance; closest:"
+        of = counted(len(selection), "instance")
+        fits = f"fits {len(self.lit)} of {of}" if self.lit else "fits no instance; closest:"
         shown = selection[: min(max(len(self.lit), 5), MATCHES)]
         bars = tuple((self._beside(match), match.score) for match in shown)
         return Answer(word, (fits,), bars, meaning(selection.calibrated))
@@ -200,7 +201,7 @@ class LiveScene:
         """Light one instance and tell what it is."""
         row = self.instances[instance]
         self.lit = {instance}
-        lines = [f"instance {instance} · {row.points:,} points · {row.views} views"]
+        lines = [f"instance {instance} · {counted(row.points, 'point')} · {counted(row.views, 'view')}"]
         if row.oriented_box is not None and row.centroid is not None:
             size = " x ".join(f"{length:.3g}" for length in row.oriented_box.size)
             lines.append(f"size {size} · at {', '.join(map(coordinate, row.centroid))}")

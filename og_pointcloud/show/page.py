@@ -20,7 +20,7 @@ from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.instances import with_boxes
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import WORDS, meaning
@@ -77,8 +77,9 @@ def write_page(
     xyz = result.xyz[shown]
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     middle = low + (high - low) / 2
+    instances = int((scene.cloud.instances.points > 0).sum())
     data = {
-        "subtitle": f"{len(shown):,} points · {(scene.cloud.instances.points > 0).sum()} instances",
+        "subtitle": f"{counted(len(shown), 'point')} · {counted(instances, 'instance')}",
         **asdict(look), "meaning": meaning(result.calibrated),
         "grey": NO_LABEL, "hues": label_colors(np.arange(len(scene.instances))).tolist(),
         "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,  # points lie on surfaces: two dimensions
