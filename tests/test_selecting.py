@@ -1,6 +1,7 @@
 """Selection by a word: the ranking against plain cosines, the competition of words, and what no word finds."""
 
 import json
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -125,7 +126,18 @@ def test_command(tmp_path, capsys):
     bundle = og.write_bundle(mugs_and_a_cup().cloud, tmp_path / "mugs.ogpc")
     out = output_of(capsys, "select", bundle, "mug")
     assert out.startswith("'mug' fits 2 of 3 instances\n* instance 0")
-    assert "1 instances have no feature" in out
+    assert "no feature that a word could be compared with: 1 instance\n" in out
     record = json.loads(output_of(capsys, "select", bundle, "mug", "--against", "", "--json"))
     assert [match["instance"] for match in record["matches"] if match["fits"]] == [0]
     assert "zebra" in error_of(capsys, "select", bundle, "zebra")
+
+
+@pytest.mark.parametrize("against", [[], ["--against", ""]])
+def test_what_is_typed_next_takes_what_was_selected(tmp_path, capsys, monkeypatch, against):
+    monkeypatch.chdir(tmp_path)
+    og.write_bundle(mugs_and_a_cup().cloud, tmp_path / "mugs.ogpc")
+    lines = output_of(capsys, "select", "mugs.ogpc", "mug", *against).splitlines()
+    selected = [int(line.split()[2]) for line in lines if line.startswith("* instance")]
+    assert selected == ([0] if against else [0, 1])
+    typed = shlex.split(lines[-1].removeprefix("next: og-pointcloud "))
+    assert json.loads(output_of(capsys, *typed, "--json"))["instances"] == selected

@@ -10,6 +10,7 @@ import argparse
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
+from og_pointcloud.errors import counted
 
 
 def add(parser: Parser) -> None:
@@ -26,9 +27,11 @@ def run(arguments: argparse.Namespace) -> None:
         return
     print(selection)
     if selection.unknown:
-        print(f"{selection.unknown} instances have no feature that a word could be compared with")
+        print(f"no feature that a word could be compared with: {counted(selection.unknown, 'instance')}")
     if not selection.calibrated:
         print(f"not calibrated: scores are cosines. {common.calibration_hint(arguments.bundle)}")
     if selection.fitting:
-        given = common.as_given(arguments, "--text-features")
-        common.print_next("edit", "extract", arguments.bundle, "--word", arguments.text, *given, "-o", "selected.ply")
+        # `edit` takes a word's instances among all words that are known: among others their ids name them.
+        word = ["--word", arguments.text, *common.as_given(arguments, "--text-features")]
+        what = word if against is None else ["--id", ",".join(map(str, selection.instances))]
+        common.print_next("edit", "extract", arguments.bundle, *what, "-o", "selected.ply")
