@@ -416,6 +416,9 @@ def test_a_browser_that_leaves_while_it_is_timed_is_sent_nothing_more(shown_in, 
     _live, browser, screen = shown_in(0.9, 0.1)
     assert left == [screen]
     assert (screen.sends_pictures, browser.drawn.visible) == (False, False)
+    asked, browser.get_render = [], lambda *_, **__: asked.append(True)
+    screen._time(browser.drawn)  # of another scene, which waited
+    assert not asked
 
 
 def test_a_picture_that_comes_late_is_in_the_colors_of_now(shown_in):

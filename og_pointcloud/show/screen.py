@@ -162,10 +162,11 @@ class Screen:
         self._turned.set()
 
     def _probe(self, node: Any) -> float:
-        """Seconds until a small picture is here; 0 once other points are on show, which are timed by themselves."""
+        """Seconds until a small picture is here; 0 once the browser has left, or other points are on show, which are
+        timed by themselves."""
         seconds = []
         for _ in range(PROBES):
-            if self._node is not node:
+            if not self._open or self._node is not node:
                 return 0.0
             start = time.monotonic()
             self._client.get_render(*PROBE_PX, timeout=PROBE_S)
