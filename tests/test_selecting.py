@@ -129,7 +129,9 @@ def test_command(tmp_path, capsys):
     assert "no feature that a word could be compared with: 1 instance\n" in out
     record = json.loads(output_of(capsys, "select", bundle, "mug", "--against", "", "--json"))
     assert [match["instance"] for match in record["matches"] if match["fits"]] == [0]
-    assert "zebra" in error_of(capsys, "select", bundle, "zebra")
+    error = error_of(capsys, "select", bundle, "zebra")
+    assert "'zebra' is not among the 2 known words" in error
+    assert "(--text-features)" in error
 
 
 @pytest.mark.parametrize("against", [[], ["--against", ""]])

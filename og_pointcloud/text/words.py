@@ -68,9 +68,9 @@ def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
 
 def _ways(feature_space: str) -> str:
     return (
-        "pass {name: vector}, or text_features=FILE.npz with 'names', 'vectors' and 'feature_space' from the scene's "
-        "encoder; or store them (og-pointcloud vocabulary add); or, for any word at all, make the encoder once: "
-        f"{export_command(feature_space)}"
+        "pass {name: vector}, or text_features=FILE.npz (--text-features) with 'names', 'vectors' and 'feature_space' "
+        "from the scene's encoder; or store them (og-pointcloud vocabulary add); or, for any word at all, make the "
+        f"encoder once: {export_command(feature_space)}"
     )
 
 
