@@ -180,4 +180,6 @@ def test_a_model_without_patches_is_refused(tmp_path):
         make_masks(tmp_path / "c", MaskSettings(features="dense"), progress=False)
     with pytest.raises(OgPointcloudError, match="features are 'thick'; expected one of crops, dense"):
         MaskSettings(features="thick")
+    with pytest.raises(OgPointcloudError, match="features are 'dense' without an encoder"):
+        MaskSettings(features="dense", encoder=None)
     assert open_encoder("demo").width

@@ -115,6 +115,8 @@ class MaskSettings:
     def __post_init__(self) -> None:
         if self.features not in FEATURES:
             raise OgPointcloudError(f"features are '{self.features}'; expected one of {', '.join(FEATURES)}")
+        if self.features != "crops" and self.encoder is None:
+            raise OgPointcloudError(f"features are '{self.features}' without an encoder; expected one, or crops")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
         if isinstance(self.words, str):  # which would be a word for each of its letters
