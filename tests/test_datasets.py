@@ -262,8 +262,12 @@ def test_damaged_data_sets_name_the_file_and_the_cure(tmp_path, write, file, con
 
 def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):
     names = nerfstudio(tmp_path)
+    assert f"next: og-pointcloud masks {tmp_path}\n" in output_of(capsys, "fuse", tmp_path)
+    (tmp_path / "points.ply").unlink()
     add_masks(tmp_path, names, SIZE)
-    assert "6 depth images" in output_of(capsys, "fuse", tmp_path)
+    said = output_of(capsys, "fuse", tmp_path)
+    assert "6 depth images" in said
+    assert f"next: og-pointcloud fit {tmp_path} -o scene.ogpc\n" in said
     cloud = read_points(tmp_path / "points.ply")
     assert distance_to_surface(cloud.xyz_world).max() < 0.03
     assert cloud.rgb is not None

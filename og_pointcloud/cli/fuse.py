@@ -27,6 +27,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
     check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
+    from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
+    from og_pointcloud.formats.mask_files import FEATURES_NAME
     from og_pointcloud.formats.ply import plain_rows, write_ply
 
     start = time.perf_counter()
@@ -40,4 +42,5 @@ def run(arguments: argparse.Namespace) -> None:
     )
     print(f"wrote {output}")
     if arguments.output is None:
-        print_next("fit", arguments.capture, "-o", "scene.ogpc")
+        masked = any((arguments.capture / name).exists() for name in (FEATURES_NAME, LANGUAGE_FEATURES_FOLDER))
+        print_next(*(("fit", arguments.capture, "-o", "scene.ogpc") if masked else ("masks", arguments.capture)))
