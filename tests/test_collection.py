@@ -139,6 +139,7 @@ def test_a_word_is_never_asked_in_the_space_of_another_encoder(folder):
     found = collection.find("lamp", top=100)
     assert {finding.scene for finding in found} == {"ours"}
     assert len(found.not_asked) == 3
+    assert found.not_asked[0].startswith("1 scene of feature space 'another/encoder' could not be asked for 'lamp'")
     found = collection.find("chair", top=100)
     assert {finding.scene for finding in found} == {"ours", "same name"}
     best = {finding.scene: finding.instance for finding in reversed(found)}

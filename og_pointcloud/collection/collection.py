@@ -21,7 +21,7 @@ from og_pointcloud.collection.index import Changes, Family, Group, families, ind
 from og_pointcloud.collection.lance import FEW_SCENES, LanceTables
 from og_pointcloud.collection.scoring import Block, load_block, share
 from og_pointcloud.collection.store import Atlas, SceneEntry
-from og_pointcloud.errors import OgPointcloudError, did_you_mean
+from og_pointcloud.errors import OgPointcloudError, counted, did_you_mean
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import read_text_features
@@ -190,7 +190,8 @@ class Collection:
             for word in set(names) - known.keys():
                 counts[word, group.family.feature_space] += len(wanted.among(group))
         not_asked = tuple(
-            f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
+            f"{counted(count, 'scene')} of feature space '{space}' could not be asked for '{word}': its vector there "
+            "is not known"
             for (word, space), count in sorted(counts.items())
         )
         return Findings((finding for _, finding in ranked[:top]), not_asked)
@@ -204,8 +205,8 @@ class Collection:
             fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
             if not fitting:
                 raise OgPointcloudError(
-                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected one of the "
-                    f"{len(self.entries)} scenes of {self.path}"
+                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected a name "
+                    f"or pattern of the scenes of {self.path} ({len(self.entries):,})"
                 )
             ids.update(self._by_name[name].id for name in fitting)
         if not ids:
