@@ -62,6 +62,7 @@ A, B = range(50), range(50, 100)
 
 
 PARTS = [(range(25), ONE), (range(25, 50), ONE)]
+THIRD = range(80, 100), OTHER
 NOTHING = np.zeros(8, np.float32)
 PLAIN: dict[str, tuple[list[HandView], list[int]]] = {
     "two objects seen by all views are two groups": ([[(A, ONE), (B, OTHER)]] * 4, [0, 1] * 4),
@@ -75,6 +76,13 @@ PLAIN: dict[str, tuple[list[HandView], list[int]]] = {
     "parts that no view shows whole stay apart": ([PARTS] * 4, [0, 1] * 4),
     "one other view is enough to show that a mask spans": (
         [[(range(90), ONE)], [(range(start, start + 30), ONE) for start in (0, 30, 60)]], [-1, 0, 1, 2]
+    ),
+    "views that have a mask of one thing alone outvote one that takes two for one": (
+        [[(range(80), ONE), THIRD], *[[(range(40), ONE), THIRD], [(range(40, 80), ONE), THIRD]] * 3],
+        [0, 1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1, 2, 1]
+    ),
+    "views that have a mask of neither say nothing": (
+        [[*PARTS, (B, OTHER)], *[[(A, ONE), (B, OTHER)]] * 2, *[[(B, OTHER)]] * 5], [1, 1, 0, 1, 0, 1, 0, *[0] * 5]
     ),
     "a mask that shows nothing belongs to no group": ([[(A, ONE), ([], OTHER)], [(A, ONE)]], [0, -1, 0]),
     "one view gives one group a mask": ([[(range(start, 100, 3), ONE) for start in range(3)]], [0, 1, 2]),
@@ -153,12 +161,30 @@ def test_a_part_with_the_feature_of_the_whole_is_joined() -> None:
     assert table == part
 
 
+def test_many_noisy_features_are_no_more_alike_than_pairs_of_them() -> None:
+    """Sums of features have less noise, and sums of any two things are more alike than two masks of them."""
+    random = np.random.default_rng(0)
+
+    def feature(own: int, sign: float) -> NDArray[np.float32]:
+        return (sign * 0.7 * np.eye(64)[own] + np.eye(64)[0] + 0.25 * random.normal(size=64)).astype(np.float32)
+
+    def others() -> list[tuple[range, NDArray[np.float32]]]:
+        return [(range(100 + 10 * k, 110 + 10 * k), feature(2 + k, 1)) for k in range(6)]
+
+    # Ten views have a mask of each of two things alone; two views take them for one.
+    views = [[(points, feature(1, 1 if points is A else -1)), *others()] for points in [A, B] * 10 + [range(100)] * 2]
+    table = hand_table(160, [[(points, vector[:8]) for points, vector in view] for view in views])
+    table = replace(table, mask_features=np.array([vector for view in views for _, vector in view]))
+    group = groups_of(table, replace(SETTINGS, left_out_voice=0))
+    assert group[0] == group[14] != group[7] == group[21]
+
+
 def test_a_view_that_saw_a_sliver_is_no_witness() -> None:
     """View 0 sees five points of each object and shows them as one; two views show two objects."""
     views = [[(range(100), ONE)], [(A, ONE), (B, OTHER)], [(A, ONE), (B, OTHER)]]
     hidden = [[*range(45), *range(55, 100)]]
     table = hand_table(100, views, hidden)
-    share = mask_shares(table, replace(SETTINGS, witness_share=0.2)).toarray()
+    share = mask_shares(table, replace(SETTINGS, witness_share=0.2))[0].toarray()
     assert (share[1:, 0] == 0).all()
     assert (share[0, 1:] > 0).all()
     group = groups_of(table)
@@ -306,8 +332,12 @@ def reference_groups(table: MaskTable) -> NDArray[np.int32]:
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     view = table.mask_view
     masks, views = len(view), len(vote)
-    share = np.zeros((masks, masks))
+    share, left_out = np.zeros((masks, masks)), np.zeros((masks, views), bool)
     for i in range(masks):
+        for v in range(views):
+            visible = in_mask[i] @ vote[v]
+            if visible > SETTINGS.witness_share * (in_mask[i] @ in_mask[i]):
+                left_out[i, v] = in_mask[i] @ in_mask[view == v].sum(axis=0) < 0.5 * visible
         for j in range(masks):
             visible = in_mask[i] @ vote[view[j]]
             if visible > SETTINGS.witness_share * (in_mask[i] @ in_mask[i]):
@@ -321,7 +351,7 @@ def reference_groups(table: MaskTable) -> NDArray[np.int32]:
             ]
             if holders:
                 container[i, v] = max(holders, key=lambda j: share[i, j])
-    group = reference_joins(share, container, table.unit_features.astype(float), view, ~spanning)
+    group = reference_joins(share, container, left_out, table.unit_features.astype(float), view, ~spanning)
     shown = table.weights.toarray().sum(axis=1)
     by_mass = sorted({frozenset(members) for members in group}, key=lambda members: -shown[list(members)].sum())
     number = np.full(masks, -1, np.int32)
@@ -351,6 +381,7 @@ def reference_spanning(share: NDArray[np.float64], view: NDArray[np.int32], view
 def reference_joins(
     share: NDArray[np.float64],
     container: NDArray[np.int_],
+    left_out: NDArray[np.bool_],
     features: NDArray[np.float64],
     view: NDArray[np.int32],
     usable: NDArray[np.bool_],
@@ -366,13 +397,13 @@ def reference_joins(
                 together = float((both & (container[i] == container[j])).sum())
                 one += together
                 same += together if min(share[i, j], share[j, i]) > SETTINGS.container_share else 0.0
-                asked += both.sum()
+                one_alone = ((container[i] >= 0) & left_out[j]) | ((container[j] >= 0) & left_out[i])
+                asked += both.sum() + 0.5 * one_alone.sum()
         if asked == 0:
             return 0.0, 0.0, 0.0
-        mean_a, mean_b = features[a].sum(axis=0), features[b].sum(axis=0)
-        cosine = mean_a @ mean_b / np.linalg.norm(mean_a) / np.linalg.norm(mean_b)
+        cosine = np.mean([features[i] @ features[j] for i in a for j in b])
         below = 0.5 * ((different < cosine - 1e-6).mean() + (different <= cosine + 1e-6).mean())
-        return (same + (one - same) * below**2) / asked, asked, cosine
+        return (same + (one - same) * below) / asked, asked, cosine
 
     groups = [[int(i)] for i in np.flatnonzero(usable)]
     while len(groups) > 1:

@@ -7,9 +7,11 @@ Two masks of two views show the same thing as far as they share Gaussians that b
 
 so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. From it follows, per mask and view, its
 *container*: the one mask of that view holding most of it, if there is one. Each view is thus a witness for every pair
-of masks that have containers in it: "one thing" (the same container) or "two" (different ones). A view that missed an
-object says nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one
-thing": a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
+of masks that have containers in it: "one thing" (the same container) or "two" (different ones). A view that sees both
+and has a mask of one alone says "two" with half a voice: proposers miss whole things, but sometimes parts of them. A
+view that missed both says nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups
+says "one thing": a mask that spans two objects is outvoted, parts of one object come together when other views show it
+whole.
 
 Where masks have tracks, the tracker is one witness more. It says "one thing" of two masks with the same track, also of
 the front and the back of a thing, which no view sees together, and "two" where their tracks were in one image. About
@@ -33,8 +35,8 @@ from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
 
-UNKNOWN_LIKENESS = 0.25
-"""Likeness where features say nothing: that of the middle rank, a half squared (`_likeness`)."""
+UNKNOWN_LIKENESS = 0.5
+"""Likeness where features say nothing: the middle rank (`_likeness`)."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +54,19 @@ def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np
 
     sample: the columns that overlaps are measured on; means over thousands of points need no more. None: all.
     """
-    share = mask_shares(table if sample is None else table.of_points(sample), settings)
+    share, left_out = mask_shares(table if sample is None else table.of_points(sample), settings)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
-    witnesses = _witnesses(share, container, table, settings)
+    witnesses = _witnesses(share, container, left_out, table, settings)
     shown = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     usable = ~spanning & (shown > 0)
     group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
     return MaskGroups(*_ordered(group, shown), spanning)
 
 
-def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
-    """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j.
+def mask_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, NDArray[np.bool_]]:
+    """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j. And
+    (masks, views): whether a view sees what a mask shows, most of it outside of its own masks.
 
     Holes take nothing from these votes: what shows through a plant's leaves is in its masks alike, and says as well as
     the leaves do how far two masks hold the same.
@@ -76,9 +79,11 @@ def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
     rows, cols = together.row, together.col
     base = visible[rows, table.mask_view[cols]]
     # A view that sees only a sliver of a mask is no witness of it.
-    enough = base > settings.witness_share * own[rows]
-    value = together.data[enough] / base[enough]
-    return csr_array((value, (rows[enough], cols[enough])), shape=together.shape)
+    sees = visible > settings.witness_share * own[:, None]
+    enough = sees[rows, table.mask_view[cols]]
+    share = csr_array((together.data[enough] / base[enough], (rows[enough], cols[enough])), shape=together.shape)
+    in_masks = (share @ indicator(table.mask_view, visible.shape[1]).T).toarray()
+    return share, sees & (in_masks < 1 - settings.container_share)
 
 
 def indicator(owner: NDArray[np.int32], count: int) -> csr_array:
@@ -147,8 +152,9 @@ class _Witnesses:
 
     rows, cols: the pairs that any of them shows as one thing, both ways, rows ascending. one: how many say so.
     same_extent: how many of these count whatever the features say: all if the two masks have the same extent, else the
-    tracker alone. speaks, hears: (masks, views + tracks); speaks[i] @ hears[j] is how many witnesses say anything of a
-    pair: views in which both have a container, and the tracker where both tracks are the same or were in one image.
+    tracker alone. speaks, hears: (masks, ...); speaks[i] @ hears[j] is how many witnesses say anything of a pair: views
+    in which both have a container, or one does and the other is left out; and the tracker where both tracks are the
+    same or were in one image.
     """
 
     rows: NDArray[np.int32]
@@ -159,10 +165,19 @@ class _Witnesses:
     hears: NDArray[np.float64]
 
 
-def _witnesses(share: csr_array, container: csr_array, table: MaskTable, settings: GroupingSettings) -> _Witnesses:
-    views = int(table.mask_view.max(initial=-1)) + 1
-    speaks = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
-    hears, followed = speaks, indicator(np.full(len(speaks), -1, np.int32), len(speaks))  # no pair
+def _witnesses(
+    share: csr_array,
+    container: csr_array,
+    left_out: NDArray[np.bool_],
+    table: MaskTable,
+    settings: GroupingSettings,
+) -> _Witnesses:
+    views = left_out.shape[1]
+    held = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
+    # (h + l)(h' + l') - l l' is hh' + hl' + lh': views that hold both, or hold one and leave out the other.
+    left = settings.left_out_voice * left_out
+    speaks, hears = np.column_stack([held + left, left]), np.column_stack([held + left, -left])
+    followed = indicator(np.full(len(held), -1, np.int32), len(held))  # no pair
     if table.mask_track is not None:
         # Tracks as 0, 1, ..., -1 none: np.unique counts -1 as a value, the subtraction takes it away again.
         track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
@@ -171,7 +186,7 @@ def _witnesses(share: csr_array, container: csr_array, table: MaskTable, setting
         in_view = tracks @ indicator(table.mask_view, views).T
         together = (in_view @ in_view.T).toarray() > 0  # tracks in one image, each with itself too
         # A mask speaks in the column of its track, and hears in those of all tracks that were in an image with it.
-        speaks, hears = (np.column_stack([speaks, of_track]) for of_track in (tracks.T.toarray(), tracks.T @ together))
+        speaks, hears = np.column_stack([speaks, tracks.T.toarray()]), np.column_stack([hears, tracks.T @ together])
     pairs = csr_array(container @ container.T + followed).tocoo()
     off_diagonal = pairs.row != pairs.col
     rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
@@ -196,12 +211,12 @@ def _agglomerate(
     Of pairs with the same agreement the one with more witnesses comes first, then the one with more similar features:
     the order of views and masks does not matter.
     """
-    # A group's number is that of its lowest mask; features are summed, not averaged: only their direction is asked.
+    # A group's number is that of its lowest mask. Of features the sum and the number are kept, for means over pairs.
     w, everyone = witnesses, np.arange(len(usable) + 1)
     kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
     links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
     group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
-    said = w.speaks.copy(), w.hears.copy(), total, np.linalg.norm(total, axis=1)
+    said = w.speaks.copy(), w.hears.copy(), total, features.any(axis=1).astype(np.float64)
     _join(group, links, said, cosines_of_different(features, mask_view), settings.join_majority)
     return _roots(group)
 
@@ -220,11 +235,11 @@ def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.i
 def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
     """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
 
-    links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, their length)
-    of each mask; here they become those of groups. different: as of `cosines_of_different`.
+    links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, how many) of
+    each mask; here they become the sums of groups. different: as of `cosines_of_different`.
     """
     start, others, one, same_extent = links
-    speaks, hears, features, length = said
+    speaks, hears, features, described = said
     rows = [slice(start[a], start[a + 1]) for a in range(len(group))]
     linked = [(others[row], one[row], same_extent[row]) for row in rows]
     version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
@@ -244,7 +259,7 @@ def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
         speaks[a] += speaks[b]
         hears[a] += hears[b]
         features[a] += features[b]
-        length[a] = np.sqrt(np.dot(features[a], features[a]))
+        described[a] += described[b]
         linked[a] = _pooled(linked[a], linked[b], a, group, place)
         linked[b] = others[:0], one[:0], same_extent[:0]
         _offer(heap, a, -1, linked[a], said, version, different, majority)
@@ -253,14 +268,15 @@ def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
 @njit(cache=True)
 def _offer(heap, a, above, links, said, version, different, majority):  # noqa: ANN001, ANN202
     """Puts on the heap the pairs of group a and those linked to it, of numbers above one, that most witnesses join."""
-    speaks, hears, features, length = said
+    speaks, hears, features, described = said
     for b, one, same_extent in zip(*links):  # noqa: B905
         asked = np.dot(speaks[b], hears[a])
         if b <= above or one / asked <= majority:  # features only ever take agreement away
             continue
-        both = length[a] * length[b]
-        cosine = np.dot(features[a], features[b]) / both if both > 0 else 0.0
-        alike = _likeness(cosine, different) if both > 0 else UNKNOWN_LIKENESS
+        # The mean over pairs of masks, as ``different`` is of pairs: sums have less noise, and any two are more alike.
+        pairs = described[a] * described[b]
+        cosine = np.dot(features[a], features[b]) / pairs if pairs > 0 else 0.0
+        alike = _likeness(cosine, different) if pairs > 0 else UNKNOWN_LIKENESS
         agreement = (same_extent + (one - same_extent) * alike) / asked
         if agreement > majority:
             low, high = min(a, b), max(a, b)
@@ -269,12 +285,12 @@ def _offer(heap, a, above, links, said, version, different, majority):  # noqa: 
 
 @njit(cache=True)
 def _likeness(cosine, different):  # noqa: ANN001, ANN202
-    """The share of different things that are less alike, squared."""
+    """The share of different things that are less alike."""
     if not len(different):
         return UNKNOWN_LIKENESS
     # The mean of the ranks with and without equal ones; cosines within rounding are equal.
     below = np.searchsorted(different, cosine - 1e-6, "left") + np.searchsorted(different, cosine + 1e-6, "right")
-    return (0.5 * below / len(different)) ** 2
+    return 0.5 * below / len(different)
 
 
 @njit(cache=True)
