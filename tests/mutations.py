@@ -156,6 +156,15 @@ MUTATIONS = (
         ", settings.join_majority)", ", 0.0)", ("test_grouping.py",),
     ),
     Mutation(
+        "views that leave out one of two things say nothing", "fitting/grouping.py",
+        "settings.left_out_voice * left_out.astype", "0.0 * left_out.astype", ("test_grouping.py",),
+    ),
+    Mutation(
+        "groups as alike as sums of their features", "fitting/grouping.py",
+        "np.dot(features[a], features[b]) / pairs if", "np.dot(features[a], features[b]) / np.sqrt(pairs) if",
+        ("test_grouping.py",),
+    ),
+    Mutation(
         "masks that span objects take part", "fitting/grouping.py",
         "usable = ~spanning & (shown > 0)", "usable = shown > 0", ("test_grouping.py",),
     ),

@@ -175,7 +175,7 @@ def _witnesses(
     views = left_out.shape[1]
     held = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
     # (h + l)(h' + l') - l l' is hh' + hl' + lh': views that hold both, or hold one and leave out the other.
-    left = settings.left_out_voice * left_out
+    left = settings.left_out_voice * left_out.astype(np.float64)
     speaks, hears = np.column_stack([held + left, left]), np.column_stack([held + left, -left])
     followed = indicator(np.full(len(held), -1, np.int32), len(held))  # no pair
     if table.mask_track is not None:
