@@ -65,8 +65,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
     ),
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
-        "grouping.witness_share", "grouping.left_out_voice", "membership.sure_share", "membership.sure_votes",
-        "membership.open_share",
+        "grouping.witness_share", "grouping.left_out_voice",
+        "membership.sure_share", "membership.sure_votes", "membership.open_share",
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share", "membership.own_vote", "membership.crossing",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
