@@ -185,6 +185,10 @@ MUTATIONS = (
         "outliers stay in a descriptor", "fitting/association.py",
         "kept = cosines >= middle - 3 * max(spread, 1e-6)", "kept = cosines >= -2", ("test_association.py",),
     ),
+    Mutation(
+        "the mean of all that a thing is called", "fitting/association.py",
+        "if first > CLEARLY * second else everyone", "if first > 9 * second else everyone", ("test_association.py",),
+    ),
     # Learned modes.
     Mutation(
         "Eq. 5 of masks that share nothing with the union", "fitting/learned/matching.py",

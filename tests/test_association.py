@@ -10,6 +10,8 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable
 from og_pointcloud.fitting.association import describe_instances
 
+FOURTH = np.eye(8, dtype=np.float32)[5]
+
 
 def describe(views: list[HandView], group: list[int], ids: list[int]) -> InstanceTable:
     table = hand_table(len(ids), views)
@@ -46,6 +48,24 @@ def test_evidence_is_counted() -> None:
     np.testing.assert_array_equal(result.descriptor_instance, [0, 1])
     np.testing.assert_allclose(result.agreement, 1, rtol=1e-6)
     assert len(result) == 2
+
+
+@pytest.mark.parametrize(("kinds", "clear"), [((4, 2, 2), True), ((2, 4, 2), True), ((3, 2, 2), False)])
+def test_masks_that_name_a_thing_in_several_ways_leave_it_what_clearly_most_of_them_say(
+    kinds: tuple[int, ...], clear: bool
+) -> None:
+    """Four masks to two and two describe it alone: no two of the kinds are one. Three say too little, and all do."""
+    random = np.random.default_rng(0)
+    looks = np.repeat(np.eye(8)[:3], kinds, axis=0)
+    views: list[HandView] = [
+        [([0, 1], (look + 0.05 * random.normal(size=8)).astype(np.float32)), ([2, 3], FOURTH)] for look in looks
+    ]
+    result = describe(views, [0, 1] * len(looks), [0, 0, 1, 1])
+    cosines = result.descriptors[0][:3]
+    assert cosines.argmax() == np.argmax(kinds)
+    assert (cosines.max() > 0.98) == clear
+    assert (np.sort(cosines)[0] > 0.3) != clear
+    np.testing.assert_array_equal(result.masks, [len(looks)] * 2)  # all stay evidence of the instance
 
 
 def test_an_outlier_is_left_out() -> None:

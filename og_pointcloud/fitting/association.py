@@ -4,8 +4,9 @@ Feature rows: what the encoder saw of each instance, over all views (paper, Sec.
 with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks of an instance are known from
 grouping, and the mask table tells how much each shows of it, with true visibility. A mask counts by the
 cube root of the pixels that it shows of the instance: by pixels, one close-up with a wrong name would outvote three
-views from twice as far. (Powers from 1/4 to 1/2 label scenes within 0.004 mIoU of each other.) Masks that disagree with
-the rest are left out.
+views from twice as far. (Powers from 1/4 to 1/2 label scenes within 0.004 mIoU of each other.) Where masks name an
+instance in different ways, their mean would be like no word at all; those that are named as most are describe it, and
+of these all but outliers.
 
 Parts: a handle has masks of its own in some views, while most views show it within the mask of the mug. So, for
 instances a and b, over the views that see both and have a mask of b:
@@ -21,9 +22,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.fitting.grouping import cosines_of_different
 from og_pointcloud.fitting.mask_table import MaskTable
 
 MOSTLY = 0.5
@@ -31,6 +34,12 @@ MOSTLY = 0.5
 parent; more than this share of the views must do so."""
 SEEN_SHARE = 0.1
 """A view that shows less of an instance than this share of its typical view is no evidence about it."""
+PAIRED = 60
+"""So many masks of an instance say how alike masks of one thing are; the median over all instances needs no more."""
+MOST_COMPARED = 2000
+"""Masks of an instance that are compared pair by pair: of more, all describe it."""
+CLEARLY = 1.5
+"""Masks of one kind describe an instance where they have more than so many times the weight of any other kind."""
 FEWEST_VIEWS = 2
 """At least so many views show a part in its parent: one alone could be a mask that spilled over."""
 
@@ -52,8 +61,12 @@ def describe_instances(
     rows, owners = [], []
     agreement = np.zeros(count, np.float32)
     # Masks that show nothing of their instance, or have no feature, say nothing of what it is.
-    for instance, members in enumerate(members_of(np.where((shown > 0) & features.any(axis=1), group, -1), count)):
+    described = features.any(axis=1)
+    of_instance = members_of(np.where((shown > 0) & described, group, -1), count)
+    alike = _least_alike(features, of_instance, cosines_of_different(features[described], table.mask_view[described]))
+    for instance, members in enumerate(of_instance):
         weight = np.cbrt(shown[members])
+        members, weight = (of_all[main_kind(features[members], weight, alike)] for of_all in (members, weight))
         row, kept, cosines = robust_mean(features[members], weight)
         if row is None:
             continue
@@ -100,6 +113,37 @@ def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:
     wide = rows.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0)
+
+
+def _least_alike(
+    features: NDArray[np.float64], of_instance: list[NDArray[np.intp]], different: NDArray[np.float64]
+) -> float:
+    """The cosine above which masks of one instance are named alike: halfway between those of different things
+    (``different``) and those of one instance in this scene, as medians. -1, all are, where these are not told apart."""
+    cosines = [np.zeros(0)]
+    for members in of_instance:
+        rows = features[members[:PAIRED]]
+        cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
+    same = np.concatenate(cosines)
+    if not len(same) or not len(different) or np.median(same) <= np.median(different):
+        return -1.0
+    return float(np.median(same) + np.median(different)) / 2
+
+
+def main_kind(features: NDArray[np.float64], weight: NDArray[np.float64], alike: float) -> NDArray[np.bool_]:
+    """Of unit rows those of the kind that has clearly most weight; all, where none has.
+
+    Kinds are what average linkage joins down to a mean cosine of ``alike``.
+    """
+    everyone = np.ones(len(features), bool)
+    # Of two, size alone would decide; of thousands, pairs are too many, and their mean is near the main kind anyway.
+    if not 3 <= len(features) <= MOST_COMPARED:
+        return everyone
+    distance = np.maximum(1 - (features @ features.T)[np.triu_indices(len(features), 1)], 0)
+    kind = fcluster(linkage(distance, "average"), 1 - alike, "distance")
+    of_kind = np.bincount(kind, weight)
+    *_, second, first = sorted(of_kind)  # of what no kind has the number 0, so there are two at least
+    return kind == of_kind.argmax() if first > CLEARLY * second else everyone
 
 
 def robust_mean(
