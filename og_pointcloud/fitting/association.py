@@ -66,8 +66,9 @@ def describe_instances(
     alike = _least_alike(features, of_instance, cosines_of_different(features[described], table.mask_view[described]))
     for instance, members in enumerate(of_instance):
         weight = np.cbrt(shown[members])
-        members, weight = (of_all[main_kind(features[members], weight, alike)] for of_all in (members, weight))
-        row, kept, cosines = robust_mean(features[members], weight)
+        main = main_kind(features[members], weight, alike)
+        weight = weight[main]
+        row, kept, cosines = robust_mean(features[members[main]], weight)
         if row is None:
             continue
         rows.append(row)
