@@ -393,3 +393,12 @@ def test_a_carried_encoder_is_checked_like_any_other(path, encoder_folder, tmp_p
     assert len(read_bundle(torn).cloud) == 300  # the scene itself is whole
     with pytest.raises(OgPointcloudError, match=r"t\.ogpc: text_encoder: .* was changed"):
         encoder_for(SPACE, carried_encoder(torn))
+
+
+def test_words_of_a_set_come_in_the_same_order_in_every_run() -> None:
+    """Sets of words have another order with another seed of hashes, and labels are rows of the words."""
+    names = tuple("fedcbahgij")
+    words = Vocabulary(names, np.eye(len(names), dtype=np.float32))
+    found = resolve_labels(set(names), None, words, "space")
+    assert found.names == tuple("abcdefghij")
+    np.testing.assert_array_equal(found.vectors, words.vectors[[names.index(name) for name in found.names]])

@@ -32,7 +32,7 @@ def resolve_labels(
 
     labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
     encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is, also
-    without words.
+    without words. Those of a set come in alphabetical order.
     text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
     carried: gives the encoder in the scene's file, if it has one.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
@@ -51,6 +51,8 @@ def resolve_labels(
         return _checked(labels.names, labels.vectors) if labels.names else labels
     if isinstance(labels, Mapping):
         return _checked([str(name) for name in labels], _stacked(labels, labels.values()))
+    if isinstance(labels, (set, frozenset)):  # the order of a set is another one in the next run
+        labels = sorted(labels, key=str)
     words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
     for word in words:
         if not isinstance(word, str):
