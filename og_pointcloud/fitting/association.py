@@ -34,8 +34,6 @@ MOSTLY = 0.5
 parent; more than this share of the views must do so."""
 SEEN_SHARE = 0.1
 """A view that shows less of an instance than this share of its typical view is no evidence about it."""
-PAIRED = 60
-"""So many masks of an instance say how alike masks of one thing are; the median over all instances needs no more."""
 MOST_COMPARED = 2000
 """Masks of an instance that are compared pair by pair: of more, all describe it."""
 CLEARLY = 1.5
@@ -121,12 +119,10 @@ def _least_alike(
 ) -> float:
     """The cosine above which masks of one instance are named alike: halfway between those of different things
     (``different``) and those of one instance in this scene, as medians. -1, all are, where these are not told apart."""
-    cosines = [np.zeros(0)]
-    for members in of_instance:
-        rows = features[members[:PAIRED]]
-        cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
-    same = np.concatenate(cosines)
-    if not len(same) or not len(different) or np.median(same) <= np.median(different):
+    # Each instance has one voice; pairs of all together would be gigabytes where views are thousands.
+    compared = [features[members] for members in of_instance if 2 <= len(members) <= MOST_COMPARED]
+    same = [np.median((rows @ rows.T)[np.triu_indices(len(rows), 1)]) for rows in compared]
+    if not same or not len(different) or np.median(same) <= np.median(different):
         return -1.0
     return float(np.median(same) + np.median(different)) / 2
 
