@@ -317,11 +317,11 @@ def test_what_shows_through_holes_says_which_masks_hold_the_same() -> None:
     seen = table.exposure.toarray()
     openly, through = seen.copy(), np.zeros_like(seen)
     openly[1, 150:], through[1, 150:] = 0.1, 0.9
-    holed = replace(table, exposure=csr_array(openly), through=csr_array(through))
+    holed = replace(table, exposure=csr_array(openly), doubted=csr_array(through))
     np.testing.assert_array_equal(groups_of(holed), groups_of(table))
     np.testing.assert_array_equal(groups_of(table), [0, 1, 0, 1])
     # Without it, what is left of the vase in that view is mostly the plant's.
-    assert not np.array_equal(groups_of(replace(holed, through=None)), groups_of(table))
+    assert not np.array_equal(groups_of(replace(holed, doubted=None)), groups_of(table))
 
 
 # The literal reference: the module's formulas with dense arrays and loops over pairs.

@@ -123,8 +123,8 @@ def test_what_shows_through_a_hole_keeps_a_little_of_its_weight() -> None:
     np.testing.assert_allclose(kept[400:][through], SEEN_THROUGH, rtol=1e-6)
     np.testing.assert_allclose(after.exposure.toarray()[0], exposed * kept, rtol=1e-6)
     # What masks have in common is compared as if there were no hole.
-    assert after.through.nnz == through.sum()
-    np.testing.assert_allclose(after.with_holes().exposure.toarray()[0], exposed, rtol=1e-6)
+    assert after.doubted.nnz == through.sum()
+    np.testing.assert_allclose(after.with_doubted().exposure.toarray()[0], exposed, rtol=1e-6)
     few = np.arange(0, n, 7)
-    np.testing.assert_array_equal(after.of_points(few).with_holes().exposure.toarray()[0], exposed[few])
+    np.testing.assert_array_equal(after.of_points(few).with_doubted().exposure.toarray()[0], exposed[few])
     assert share == pytest.approx(0.9 * through.sum() / n, rel=1e-3)

@@ -101,7 +101,7 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
     features = np.concatenate([view.mask_features for view in views])
     mask_view = np.repeat(np.arange(5, dtype=np.int32), counts)
     table = MaskTable(weights, outside, exposure, mask_view, np.arange(8, dtype=np.int32), features, np.arange(8))
-    joined = Photographs.of(views).joined(replace(table, through=through))
+    joined = Photographs.of(views).joined(replace(table, doubted=through))
     # Masks a0, a2, b0, b1, b3 and the two of the last view, by the rows that are their parts.
     parts = [[1], [0, 2], [3], [4], [5], [6], [7]]
     photographs = [[0, 2], [1, 3], [4]]
@@ -111,7 +111,7 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
         joined.outside.toarray(), [dense[1][part].sum(axis=0) for part in photographs], rtol=1e-6
     )
     np.testing.assert_allclose(
-        joined.through.toarray(), [dense[3][part].sum(axis=0) for part in photographs], rtol=1e-6
+        joined.doubted.toarray(), [dense[3][part].sum(axis=0) for part in photographs], rtol=1e-6
     )
     least = [np.minimum(1, dense[2][part].sum(axis=0)) for part in photographs]
     np.testing.assert_allclose(joined.exposure.toarray(), least, rtol=1e-6)

@@ -18,7 +18,7 @@ from og_pointcloud.rendering.geometry import Neighbourhood
 DIFFERENCES = 443
 """Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
 LEAST_PAIRS = 30
-"""Colors are not asked in a scene with fewer sure pairs than this within one state, or between two."""
+"""Colors are not asked in a scene with fewer pairs than this, all told, of either of the cases to be told apart."""
 SURENESS_POWER = 4
 """A pair of points counts by this power of the sureness of both: where views disagree, the border lies elsewhere."""
 MOST = 9.0
@@ -33,19 +33,26 @@ def color_ratios(
 
     rgb: (n, 3) or None. ids: (n,) the state of each point. sureness: (n,) in [0, 1], how sure views are of it.
     """
-    none = np.ones(DIFFERENCES, np.float32)
     if rgb is None:
-        return none
+        return np.ones(DIFFERENCES, np.float32)
     # In steps of 1/256 the products, and so their sums in float64, are exact: the points' order does not matter.
     voice = np.rint(256 * sureness**SURENESS_POWER) / 256
-    one, two = _counted(np.ascontiguousarray(rgb), ids, voice, around.index, around.adjoining)
-    if min(one.sum(), two.sum()) < LEAST_PAIRS:
-        return none
-    # The chance of one state given the difference, as if pairs of one state and of two were equally frequent: most
-    # neighbors are of one state, which says nothing about colors.
-    one, both = one / one.sum(), one / one.sum() + two / two.sum()
+    return likelihood_ratios(*_counted(np.ascontiguousarray(rgb), ids, voice, around.index, around.adjoining))
+
+
+def likelihood_ratios(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(443,) float32: how many times likelier each difference of color is in one case than in another. It falls with
+    the difference, from at most MOST to at least 1 / MOST; 1 throughout where either was hardly ever seen.
+
+    one, other: (443,) how often each difference was seen in either.
+    """
+    if min(one.sum(), other.sum()) < LEAST_PAIRS:
+        return np.ones(DIFFERENCES, np.float32)
+    # The chance of the one case given the difference, as if both were equally frequent: most neighbors are of one
+    # state, say, which tells nothing about colors.
+    one, both = one / one.sum(), one / one.sum() + other / other.sum()
     seen = np.flatnonzero(both)
-    # Counts are noisy; a larger difference never speaks more for one state. Differences not seen are interpolated.
+    # Counts are noisy; a larger difference never speaks more for the one. Differences not seen are interpolated.
     chance = isotonic_regression(one[seen] / both[seen], weights=both[seen], increasing=False).x
     chance = np.clip(np.interp(np.arange(DIFFERENCES), seen, chance), 1 / (1 + MOST), MOST / (1 + MOST))
     return (chance / (1 - chance)).astype(np.float32)
@@ -61,7 +68,7 @@ def neighbour_weights(
 
 
 @njit(cache=True)
-def _difference(a, b):  # noqa: ANN001, ANN202
+def color_difference(a, b):  # noqa: ANN001, ANN201
     """Euclidean distance of two colors, rounded. In float64: differences of uint8 would wrap around."""
     total = 0.0
     for channel in range(3):
@@ -80,7 +87,7 @@ def _counted(rgb, ids, voice, neighbours, adjoining):  # noqa: ANN001, ANN202
         for k in range(neighbours.shape[1]):
             other = neighbours[g, k]
             if adjoining[g, k] and voice[other] > 0:
-                count[int(ids[g] != ids[other]), _difference(rgb[g], rgb[other])] += voice[g] * voice[other]
+                count[int(ids[g] != ids[other]), color_difference(rgb[g], rgb[other])] += voice[g] * voice[other]
     return count
 
 
@@ -90,5 +97,5 @@ def _weights(rgb, neighbours, adjoining, ratios):  # noqa: ANN001, ANN202
     for g in prange(len(neighbours)):
         for k in range(neighbours.shape[1]):
             if adjoining[g, k]:
-                weights[g, k] = ratios[_difference(rgb[g], rgb[neighbours[g, k]])]
+                weights[g, k] = ratios[color_difference(rgb[g], rgb[neighbours[g, k]])]
     return weights

@@ -20,6 +20,7 @@ from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.reliability import likely_cause, split_half
+from og_pointcloud.fitting.seen_colors import doubted_by_color
 from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -222,8 +223,9 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
         # Areas were counted in pixels of the thinned images.
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
         table = front_surfaces(surface, table, settings, journal)
-        # Mode paper draws views again, and asks for the masks of each.
-        return table if settings.mode == "paper" else Photographs.of(views).joined(table)
+        if settings.mode == "paper":  # which draws views again, and asks for the masks of each
+            return table
+        return Photographs.of(views).joined(doubted_by_color(table, surface.scene.points, views, surface.near))
 
 
 def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:

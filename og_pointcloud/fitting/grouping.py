@@ -68,10 +68,10 @@ def mask_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array
     """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j. And
     (masks, views): whether a view sees what a mask shows, most of it outside of its own masks.
 
-    Holes take nothing from these votes: what shows through a plant's leaves is in its masks alike, and says as well as
-    the leaves do how far two masks hold the same.
+    Holes and colors take nothing from these votes: what shows through a plant's leaves is in its masks alike, and says
+    as well as the leaves do how far two masks hold the same.
     """
-    votes = view_votes(table.with_holes())
+    votes = view_votes(table.with_doubted())
     weights, seen = votes.in_mask, votes.vote
     together = (weights @ weights.T).tocoo()  # N_ij
     visible = (weights @ seen.T).toarray()  # N_ib

@@ -45,8 +45,9 @@ class MaskTable:
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
     mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks. names: (views,), of the views.
-    through: (views, n) sparse float32, exposure beside the above that comes through holes of an object: it says what
-        masks have in common, not what a point is. None: none.
+    doubted: (views, n) sparse float32, exposure that was taken from the above as it comes through holes of an object,
+        or as colors speak against it (seen_colors.py; below 0 where they speak for more): it says what masks have in
+        common, not what a point is. None: none.
     """
 
     weights: csr_array
@@ -57,7 +58,7 @@ class MaskTable:
     mask_features: NDArray[np.float32]
     mask_track: NDArray[np.int64] | None = None
     names: tuple[str, ...] = ()
-    through: csr_array | None = None
+    doubted: csr_array | None = None
 
     @property
     def unit_features(self) -> NDArray[np.float32]:
@@ -75,17 +76,17 @@ class MaskTable:
         """The table of some of its points, in ascending order."""
         if len(rows) == self.exposure.shape[1]:
             return self
-        matrices = (self.weights, self.outside, self.exposure, self.through)
-        weights, outside, exposure, through = (m if m is None else csr_array(m[:, rows]) for m in matrices)
-        return replace(self, weights=weights, outside=outside, exposure=exposure, through=through)
+        matrices = (self.weights, self.outside, self.exposure, self.doubted)
+        weights, outside, exposure, doubted = (m if m is None else csr_array(m[:, rows]) for m in matrices)
+        return replace(self, weights=weights, outside=outside, exposure=exposure, doubted=doubted)
 
-    def with_holes(self) -> MaskTable:
-        """The table as if objects had no holes: what shows through them is exposed as openly as it is seen."""
-        if self.through is None:
+    def with_doubted(self) -> MaskTable:
+        """The table without doubts: everything is exposed as openly as geometry says."""
+        if self.doubted is None:
             return self
-        exposure = csr_array(self.exposure + self.through)
+        exposure = csr_array(self.exposure + self.doubted)
         np.minimum(exposure.data, 1, out=exposure.data)
-        return replace(self, exposure=exposure, through=None)
+        return replace(self, exposure=exposure, doubted=None)
 
 
 def mask_table(

@@ -209,7 +209,7 @@ def without_see_through(
     )
     exposure = _scaled(table.exposure, left)
     through = csr_array(through, shape=exposure.shape)
-    return replace(table, weights=_scaled(weights, kept), exposure=exposure, through=through), share
+    return replace(table, weights=_scaled(weights, kept), exposure=exposure, doubted=through), share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -287,7 +287,7 @@ def _exposure_left(first_mask, weights, outside, exposure, kept, n, left):  # no
         for e in range(start[view], start[view + 1]):
             g = index[e]
             left[e] = 1 - hidden[g] / shown[g] if hidden[g] > 0 else 1
-            # Masks may still be compared by what shows through holes (`MaskTable.with_holes`).
+            # Masks may still be compared by what shows through holes (`MaskTable.with_doubted`).
             if behind_hole[g] > 0:
                 through[end], through_index[end] = exposed[e] * behind_hole[g] / shown[g], g
                 end += 1

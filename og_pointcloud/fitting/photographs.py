@@ -59,7 +59,7 @@ class Photographs:
             weights=_summed(table.weights, self.of_mask, len(self.first)),
             outside=_summed(table.outside, *views),
             exposure=exposure,
-            through=None if table.through is None else _summed(table.through, *views),
+            doubted=None if table.doubted is None else _summed(table.doubted, *views),
             names=self.names,
             mask_view=self.of_view[table.mask_view[self.first]],
             mask_pixels=np.bincount(self.of_mask, table.mask_pixels, len(self.first)).astype(np.int32),

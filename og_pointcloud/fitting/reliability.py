@@ -192,7 +192,7 @@ def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int
         weights, outside, exposure, np.searchsorted(views, table.mask_view[masks]).astype(np.int32),
         table.mask_pixels[masks], table.mask_features[masks],
         None if table.mask_track is None else table.mask_track[masks],
-        through=None if table.through is None else _cut(table.through, views, points),
+        doubted=None if table.doubted is None else _cut(table.doubted, views, points),
     )  # fmt: skip
 
 

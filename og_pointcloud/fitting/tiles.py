@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.colors import DIFFERENCES
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
@@ -37,6 +38,7 @@ from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sigh
 from og_pointcloud.fitting.membership import SceneVotes, assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
+from og_pointcloud.fitting.seen_colors import believed, differences, readable_photograph, sight_ratios
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
@@ -81,7 +83,7 @@ Rows = NDArray[np.integer]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
 """What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure.
-M + 2: exposure through holes."""
+M + 2: exposure through holes. M + 3: 1 + the difference of its color from its pixel's (seen_colors.py)."""
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
@@ -130,7 +132,7 @@ def fit_tiles(
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
         look = partial(_look_at, cloud, drawing, settings)
-        looked = run(look, [replace(view, image=None) for view in scene.views], "visibility")
+        looked = run(look, scene.views, "visibility")
         shown = _all_shown(scene, cloud, looked, journal)
     with journal.stage("grouping"):
         grouped = _groups(cloud, shown, settings, journal)
@@ -216,7 +218,7 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
 class _Shown:
     """What all views show. keys: of the array of ENTRY of each view in the cloud's work folder, sorted by point. first:
     (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as `MaskTable`, of
-    the views; ``photographs`` are these views."""
+    the views; ``photographs`` are these views. sight_ratios: what their colors say (seen_colors.py)."""
 
     keys: tuple[str, ...]
     first: Rows
@@ -224,6 +226,7 @@ class _Shown:
     mask_features: NDArray[np.float32]
     mask_track: NDArray[np.int64] | None
     photographs: Photographs
+    sight_ratios: NDArray[np.float32]
 
     def table(self, cloud: TiledCloud, rows: NDArray[np.integer]) -> MaskTable:
         """The mask table of some points, given in ascending order: of photographs, not of the views cut from them."""
@@ -240,16 +243,18 @@ class _Shown:
             part["point"] = place[part["point"]]
             stacks.append(_stacked(part, int(masks[view]), len(rows)))
         of_views = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
-        weights, outside, exposure, through = of_views
+        weights, outside, exposure, through, difference = of_views
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
-        return self.photographs.joined(MaskTable(weights, outside, exposure, *masks_of_views, through=through))
+        table = MaskTable(weights, outside, exposure, *masks_of_views, doubted=through)
+        # Every exposure has its difference: both are of the same points, in the same order.
+        return self.photographs.joined(believed(table, (difference.data - 1).astype(np.uint16), self.sight_ratios))
 
 
 def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, ...]:
-    """Weights (masks, n), outside, exposure and that through holes (1, n) of one view."""
-    matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 3, points))
-    return matrix[:masks], *(matrix[row : row + 1] for row in range(masks, masks + 3))
+    """Weights (masks, n), and (1, n) outside, exposure, that through holes and differences of color of one view."""
+    matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 4, points))
+    return matrix[:masks], *(matrix[row : row + 1] for row in range(masks, masks + 4))
 
 
 def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
@@ -275,40 +280,46 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
         np.concatenate(masks),
         stacked_tracks([(view.mask_tracks, view.mask_count) for view in scene.views]),
         Photographs.of(scene.views),
+        sight_ratios(np.sum([view.colors for view in looked], axis=0)),
     )
 
 
 @dataclass(frozen=True)
 class _LookedAt:
     """A view in the work folder. first: (tiles + 1,), as in `_Shown`. masked: how many of its entries are in masks.
-    drawn: how many points were drawn, and how many there are in the image. was_there: since an earlier run."""
+    drawn: how many points were drawn, and how many there are in the image. colors: as `differences` counts them.
+    was_there: since an earlier run."""
 
     key: str
     first: Rows
     masked: int
     drawn: NDArray[np.int64]
+    colors: NDArray[np.float64]
     was_there: bool
 
 
 def _look_at(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _LookedAt:
     """Render a view, or find it in the work folder; its entries stay there."""
-    view = replace(view, masks=view.mask_map())
-    key = fingerprint(cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map()))
+    ids = view.mask_map()
+    view = replace(view, masks=ids, image=None if cloud.points.rgb is None else readable_photograph(view))
+    drawn_as = cloud.key, drawing, FINEST_PX, MOST_SPLATS
+    key = fingerprint(*drawn_as, view.name, view.image, view_fingerprint(view, ids))
     was_there = cloud.work.has("view", key)
-    entries, drawn = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
+    entries, drawn, colors = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
     first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
     masked = int(np.count_nonzero(entries["row"] < view.mask_count))
-    return _LookedAt(key, first, masked, drawn, was_there)
+    return _LookedAt(key, first, masked, drawn, colors, was_there)
 
 
 def _entries(
     view: View, cloud: TiledCloud, drawing: _Drawing, settings: FitSettings
-) -> tuple[Entries, NDArray[np.int64]]:
-    """What one view shows, sorted by point; and how many points were drawn, and how many there are in the image."""
+) -> tuple[Entries, NDArray[np.int64], NDArray[np.float64]]:
+    """What one view shows, sorted by point; how many points were drawn, and how many there are in the image; and how
+    often colors of points and pixels differ so far (`differences`)."""
     rows, larger, inside = _worth_drawing(view, cloud, drawing)
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
-        return np.zeros(0, ENTRY), counts
+        return np.zeros(0, ENTRY), counts, np.zeros((2, DIFFERENCES))
     splats = drawing.splats(cloud, rows, larger)
     apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
     thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
@@ -317,10 +328,14 @@ def _entries(
     front, _ = without_see_through(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
-    # Four blocks of rows, as ENTRY numbers them: masks, outside, exposure, exposure through holes.
+    exposure = front.exposure
+    off, colors = differences(cloud.points.take(rows), view, drawing.near, exposure.indices, exposure.data)
+    difference = csr_array((1 + off.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape)
+    # Blocks of rows, as ENTRY numbers them: masks, outside, exposure, exposure through holes, differences of color.
     masks = view.mask_count
-    blocks = [(front.weights, 0), (front.outside, masks), (front.exposure, masks + 1)]
-    blocks += [] if front.through is None else [(front.through, masks + 2)]
+    blocks = [(front.weights, 0), (front.outside, masks), (exposure, masks + 1)]
+    blocks += [] if front.doubted is None else [(front.doubted, masks + 2)]
+    blocks += [(difference, masks + 3)]
     entries = np.empty(sum(block.nnz for block, _ in blocks), ENTRY)
     end = 0
     for block, first_row in blocks:
@@ -328,7 +343,7 @@ def _entries(
         entries["point"][begin:end] = rows[block.indices]
         entries["row"][begin:end] = first_row + np.repeat(np.arange(block.shape[0]), np.diff(block.indptr))
         entries["value"][begin:end] = block.data
-    return entries[np.argsort(entries["point"], kind="stable")], counts
+    return entries[np.argsort(entries["point"], kind="stable")], counts, colors
 
 
 def _worth_drawing(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
