@@ -35,7 +35,8 @@ def cut(scene: Scene) -> Scene:
 
 
 def halves(view: View) -> list[View]:
-    ids, camera = view.mask_map(), view.camera
+    ids, image, camera = view.mask_map(), view.image_rgb(), view.camera
+    assert image is not None
     middle = camera.width // 2
     parts = []
     for name, columns in (("left", slice(0, middle)), ("right", slice(middle, camera.width))):
@@ -46,7 +47,8 @@ def halves(view: View) -> list[View]:
         half = replace(camera, width=shown.shape[1], cx=camera.cx - columns.start)
         masks, features = np.ascontiguousarray(number[shown]), view.mask_features[rows]
         cut_from = CutMasks(view.name, rows.astype(np.int64))
-        parts.append(View(f"{view.name}/{name}", half, masks, features, cut_from=cut_from))
+        pixels = np.ascontiguousarray(image[:, columns])
+        parts.append(View(f"{view.name}/{name}", half, masks, features, pixels, cut_from=cut_from))
     return parts
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.scene import Camera
 from og_pointcloud.settings import ChoosingSettings, MembershipSettings
 
 __all__ = ["Votes", "choice", "eq5", "membership", "paper_losses", "view_votes"]
@@ -216,6 +217,11 @@ def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbours: 
         for other in neighbours[g]:
             apart = np.linalg.norm(rgb[g].astype(float) - rgb[other].astype(float))
             count[int(ids[g] != ids[other]), round(apart)] += sure[g] * sure[other]
+    return likelihood_ratios(count)
+
+
+def likelihood_ratios(count: Array) -> Array:
+    """(443,) of (2, 443) counts."""
     if count.sum(axis=1).min() < 30:
         return np.ones(443)
     one, two = count / count.sum(axis=1, keepdims=True)
@@ -232,6 +238,28 @@ def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbours: 
         chance.append(min(means))
     even = np.clip(np.interp(np.arange(443), seen, chance), 0.1, 0.9)
     return even / (1 - even)
+
+
+def compared_colors(
+    camera: Camera, image: NDArray[np.uint8], xyz: Array, rgb: NDArray[np.uint8], near: float, exposure: Array
+) -> tuple[list[int], Array]:
+    """Of each point that a view exposes the difference of its color from its pixel's, 443 where there is none; and how
+    often points differ so far, (2, 443): exposed ones, by 256ths of their exposure, and others in the image."""
+    found, count = [], np.zeros((2, 443))
+    for point, color, open_ in zip(xyz, rgb, exposure, strict=True):
+        (u, v), depth = (values[0] for values in camera.project(point[None]))
+        apart = 443
+        if depth > near and 0 <= u < camera.width and 0 <= v < camera.height and image[int(v), int(u)].any():
+            apart = round(np.linalg.norm(color.astype(float) - image[int(v), int(u)].astype(float)))
+            count[int(open_ == 0), apart] += round(256 * open_) / 256 if open_ else 1
+        found += [apart] if open_ else []
+    return found, count
+
+
+def believed(exposure: float, ratio: float) -> float:
+    """The chance that a view sees a point, by Bayes' rule: half of what seems open is hidden."""
+    seen, hidden = ratio * exposure / 2, 1 - exposure / 2
+    return seen / (seen + hidden)
 
 
 # Matching, paper, Eq. 5 --------------------------------------------------------------------------------------------
