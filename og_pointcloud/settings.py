@@ -114,7 +114,7 @@ class MembershipSettings(_Checked):
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     sure_votes: float = 0.1
     """And when this share of all votes on it are for the instance, those of views without a mask of it among them."""
-    open_share: float = 0.5
+    open_share: float = 0.7
     """A point that is seen less than this share as openly as the scene's others follows its neighbours, the more so the
     less openly it is seen."""
     possible_share: float = 0.2

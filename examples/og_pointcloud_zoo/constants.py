@@ -41,8 +41,9 @@ SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
-    "fitting.colors.MOST": ("", ()),
+    "fitting.colors.MOST": ("table", ()),
     "fitting.colors.SURENESS_POWER": ("", ()),
+    "fitting.seen_colors.OPEN_IS_SEEN": ("table", ("_believe",)),
     "fitting.held_out.CLEARLY": ("table", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
     "rendering.geometry.SPARSE": ("table", ()),
@@ -71,7 +72,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share", "membership.own_vote", "membership.crossing",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
-        "fitting.colors.MOST", "fitting.colors.SURENESS_POWER",
+        "fitting.colors.MOST", "fitting.colors.SURENESS_POWER", "fitting.seen_colors.OPEN_IS_SEEN",
         "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS", "fitting.held_out.CLEARLY",
         "fitting.association.CLEARLY",
         "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",

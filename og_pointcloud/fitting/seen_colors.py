@@ -6,7 +6,7 @@ photographs fit) is another in every scene. So it is counted there, over all vie
 that geometry lets a view see, and how often at points in the image that it hides? With
 
     r    how many times likelier the difference is at seen points than at hidden ones
-    p    the chance that geometry gives a point: half of its exposure, as if of what seems open half were hidden
+    p    the chance before colors are asked: OPEN_IS_SEEN of the exposure
 
 the chance that the view sees the point is p r / (p r + 1 - p), and its exposure becomes that. What masks have in common
 is told by geometry alone, by many points each: what is taken from the exposure stays beside it (`MaskTable.doubted`).
@@ -31,6 +31,9 @@ from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import seen_from
 from og_pointcloud.scene import Points, View
 
+OPEN_IS_SEEN = 0.5
+"""Chance that a view sees a point that geometry calls open, before colors are asked: of what seems open, half may be
+hidden."""
 NO_COLOR = DIFFERENCES
 """In place of a difference, where there is none: the view has no photograph, or the point is not in it."""
 
@@ -132,6 +135,6 @@ def believed(table: MaskTable, difference: NDArray[np.uint16], ratios: NDArray[n
 def _believe(exposure, difference, ratios, rest):  # noqa: ANN001, ANN202
     """Writes to ``rest`` what is taken from each exposure; below 0 where colors speak for more than geometry does."""
     for e in range(len(exposure)):
-        p, r = 0.5 * np.float64(exposure[e]), np.float64(ratios[difference[e]])
+        p, r = OPEN_IS_SEEN * np.float64(exposure[e]), np.float64(ratios[difference[e]])
         seen = np.float32(p * r / (p * r + 1 - p))
         rest[e], exposure[e] = exposure[e] - seen, seen
