@@ -15,7 +15,7 @@ from test_membership import decide
 
 from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.colors import DIFFERENCES, LEAST_PAIRS, MOST
+from og_pointcloud.fitting.colors import DIFFERENCES, MOST, likelihood_ratios
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, doubted_by_color, sight_ratios
 from og_pointcloud.scene import Camera, Points, View
@@ -137,7 +137,7 @@ def test_a_view_without_a_photograph_counts_as_if_colors_said_nothing() -> None:
     assert without.exposure[[0]].data.max() > 0.8 > 0.2 > without.exposure[[0]].data.min()
 
 
-@pytest.mark.parametrize("kind", ["no colors", "no photographs", "one color", "few points"])
+@pytest.mark.parametrize("kind", ["no colors", "no photographs", "one color", "nothing hidden"])
 def test_colors_that_say_nothing_change_nothing(kind: str) -> None:
     points, views, table = street(np.random.default_rng(0))
     if kind == "no colors":
@@ -148,8 +148,7 @@ def test_colors_that_say_nothing_change_nothing(kind: str) -> None:
         points = replace(points, rgb=np.full((2 * AREA, 3), 90, np.uint8))
         views = [replace(view, image=np.full((SIDE, SIDE, 3), 90, np.uint8)) for view in views]
     else:
-        rows = np.r_[:AREA, AREA : AREA + LEAST_PAIRS // 3 - 1]
-        points, table = points.take(rows), table.of_points(rows)
+        points, table = points.take(np.arange(AREA)), table.of_points(np.arange(AREA))
     before = table.exposure.toarray()
     found = doubted_by_color(table, points, views, NEAR)
     np.testing.assert_array_equal(found.exposure.toarray(), before)
@@ -158,8 +157,17 @@ def test_colors_that_say_nothing_change_nothing(kind: str) -> None:
 
 def test_ratios_have_one_for_no_color() -> None:
     counts = np.zeros((2, DIFFERENCES))
-    counts[0, :20], counts[1, 60:] = 50, 5
+    counts[0, :20], counts[1, 60:] = 5000, 500
     ratios = sight_ratios(counts)
     assert ratios[NO_COLOR] == 1
     assert ratios[0] == pytest.approx(MOST)
     assert ratios[200] == pytest.approx(1 / MOST)
+
+
+def test_few_cases_say_little() -> None:
+    """Of colors that many points share, three more that are hidden: by themselves they would say all that is said."""
+    counts = np.zeros((2, DIFFERENCES))
+    counts[0, 0], counts[1, 1] = 3, 3
+    few, many = likelihood_ratios(*counts), likelihood_ratios(*(1000 * counts))
+    assert 1 < few[0] < 1.3
+    assert many[0] == pytest.approx(MOST)

@@ -17,8 +17,9 @@ from og_pointcloud.rendering.geometry import Neighbourhood
 
 DIFFERENCES = 443
 """Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
-LEAST_PAIRS = 30
-"""Colors are not asked in a scene with fewer pairs than this, all told, of either of the cases to be told apart."""
+LIKE_ALL = 30
+"""Cases in which colors are like those of all, which are added to either of two that are to be told apart: a few that
+were counted say little. 0 and 100 label scenes within 0.0001 mIoU of it."""
 SURENESS_POWER = 4
 """A pair of points counts by this power of the sureness of both: where views disagree, the border lies elsewhere."""
 MOST = 9.0
@@ -42,12 +43,16 @@ def color_ratios(
 
 def likelihood_ratios(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float32]:
     """(443,) float32: how many times likelier each difference of color is in one case than in another. It falls with
-    the difference, from at most MOST to at least 1 / MOST; 1 throughout where either was hardly ever seen.
+    the difference, from at most MOST to at least 1 / MOST; 1 throughout where either was never seen.
 
     one, other: (443,) how often each difference was seen in either.
     """
-    if min(one.sum(), other.sum()) < LEAST_PAIRS:
+    total = one + other
+    if not total.any():
         return np.ones(DIFFERENCES, np.float32)
+    # Few cases say little: either gets LIKE_ALL more that are like all of both.
+    prior = total * (LIKE_ALL / total.sum())
+    one, other = one + prior, other + prior
     # The chance of the one case given the difference, as if both were equally frequent: most neighbors are of one
     # state, say, which tells nothing about colors.
     one, both = one / one.sum(), one / one.sum() + other / other.sum()

@@ -222,8 +222,9 @@ def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbours: 
 
 def likelihood_ratios(count: Array) -> Array:
     """(443,) of (2, 443) counts."""
-    if count.sum(axis=1).min() < 30:
+    if not count.any():
         return np.ones(443)
+    count = count + 30 * count.sum(axis=0) / count.sum()
     one, two = count / count.sum(axis=1, keepdims=True)
     seen = np.flatnonzero(one + two)
     chance = []
