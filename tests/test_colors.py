@@ -20,14 +20,14 @@ SIDE = 24
 DARK, LIGHT = (40, 30, 30), (90, 120, 60)
 
 
-def grid(random: Generator) -> tuple[Neighbourhood, NDArray[np.int32], NDArray[np.float64]]:
+def grid(random: Generator, side: int = SIDE) -> tuple[Neighbourhood, NDArray[np.int32], NDArray[np.float64]]:
     """The neighbourhood of a square of points, half of them of state 0, half of state 1, most of them sure in part."""
-    x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
-    xyz = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) + random.normal(0, 0.05, (SIDE**2, 3))
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    xyz = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) + random.normal(0, 0.05, (side**2, 3))
     return (
         neighbourhood(xyz.astype(np.float32), GeometrySettings()),
-        (x.ravel() >= SIDE // 2).astype(np.int32),
-        np.where(random.random(SIDE**2) < 0.8, random.uniform(0.6, 1, SIDE**2), 0),
+        (x.ravel() >= side // 2).astype(np.int32),
+        np.where(random.random(side**2) < 0.8, random.uniform(0.6, 1, side**2), 0),
     )
 
 
@@ -54,7 +54,7 @@ def test_ratios_are_those_of_the_literal_reference(seed: int, noise: float) -> N
 
 def test_ratios_stay_within_their_bounds_where_colors_tell_all() -> None:
     random = np.random.default_rng(0)
-    around, ids, sure = grid(random)
+    around, ids, sure = grid(random, 8 * SIDE)
     found = color_ratios(colored(ids, random, 0), ids, sure, around)
     assert found.max() == pytest.approx(MOST)
     assert found.min() == pytest.approx(1 / MOST)
