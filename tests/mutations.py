@@ -107,6 +107,14 @@ MUTATIONS = (
         "(share * votes.openness)[hearsay]", "0 * (share * votes.openness)[hearsay]", ("test_membership.py",),
     ),
     Mutation(
+        "hidden points taken for seen ones", "fitting/seen_colors.py",
+        "likelihood_ratios(*counts)", "likelihood_ratios(*counts[::-1])", ("test_seen_colors.py",),
+    ),
+    Mutation(
+        "few colors say as much as many", "fitting/colors.py",
+        "one, other = one + prior, other + prior", "one, other = one, other", ("test_seen_colors.py",),
+    ),
+    Mutation(
         "colors of points that views are not sure of are asked", "fitting/colors.py",
         "sureness**SURENESS_POWER", "np.ones_like(sureness)", ("test_colors.py",),
     ),

@@ -114,6 +114,16 @@ def test_ground_that_shows_the_color_of_a_car_is_no_part_of_it(seed: int) -> Non
     np.testing.assert_array_equal(found[CAR], by_geometry[CAR])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_photographs_of_noise_change_no_label(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    points, views, table = street(random)
+    by_geometry = decide(table, [0, 0, 0], points.xyz).instance_ids
+    noise = [replace(view, image=random.integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)) for view in views]
+    found = decide(doubted_by_color(table, points, noise, NEAR), [0, 0, 0], points.xyz).instance_ids
+    assert (found == by_geometry).mean() > 0.97
+
+
 def test_beliefs_do_not_depend_on_the_order_of_points() -> None:
     points, views, table = street(np.random.default_rng(0))
     order = np.random.default_rng(1).permutation(2 * AREA)
