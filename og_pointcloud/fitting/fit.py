@@ -225,7 +225,8 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
         table = front_surfaces(surface, table, settings, journal)
         if settings.mode == "paper":  # which draws views again, and asks for the masks of each
             return table
-        return Photographs.of(views).joined(doubted_by_color(table, surface.scene.points, views, surface.near))
+        table = doubted_by_color(table, surface.scene.points, views, surface.near, progress=journal.progress)
+        return Photographs.of(views).joined(table)
 
 
 def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:

@@ -27,6 +27,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.colors import DIFFERENCES, color_difference, likelihood_ratios
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
+from og_pointcloud.journal import with_bar
 from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import seen_from
 from og_pointcloud.scene import Points, View
@@ -40,9 +41,11 @@ NO_COLOR = DIFFERENCES
 Doubles = NDArray[np.float64]
 
 
-def doubted_by_color(table: MaskTable, points: Points, views: Sequence[View], near: float) -> MaskTable:
+def doubted_by_color(
+    table: MaskTable, points: Points, views: Sequence[View], near: float, *, progress: bool = False
+) -> MaskTable:
     """The table with exposures that colors bear out. It takes the place of the given one, whose exposure is written
-    over. points, views: what it was made from. near: depth of the near plane, scene units."""
+    over. points, views: what it was made from. near: depth of the near plane, scene units. progress: show a bar."""
     if points.rgb is None or all(view.image is None for view in views):
         return table
     start, columns, exposure = table.exposure.indptr, table.exposure.indices, table.exposure.data
@@ -54,7 +57,8 @@ def doubted_by_color(table: MaskTable, points: Points, views: Sequence[View], ne
         return counts
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        counts = sum(pool.map(compare, range(len(views))), np.zeros((2, DIFFERENCES)))
+        compared = with_bar(pool.map(compare, range(len(views))), "colors", len(views), progress)
+        counts = sum(compared, np.zeros((2, DIFFERENCES)))
     return believed(table, difference, sight_ratios(counts))
 
 
