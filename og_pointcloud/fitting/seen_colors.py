@@ -127,18 +127,27 @@ def believed(table: MaskTable, difference: NDArray[np.uint16], ratios: NDArray[n
     """
     if (ratios == 1).all():
         return table
-    exposure = table.exposure
-    rest = scratch_like(exposure.data, np.float32)
-    _believe(exposure.data, difference, ratios, rest)
+    exposure, holes = table.exposure, table.doubted
+    if holes is None:
+        holes = csr_array(exposure.shape, dtype=np.float32)
+    taken = scratch_like(exposure.data, np.float32)
+    _believe(*((matrix.indptr, matrix.indices, matrix.data) for matrix in (exposure, holes)), difference, ratios, taken)
     # In the same rows and columns, which are not copied.
-    doubted = csr_array((rest, exposure.indices, exposure.indptr), shape=exposure.shape)
-    return replace(table, doubted=doubted if table.doubted is None else csr_array(doubted + table.doubted))
+    return replace(table, doubted=csr_array((taken, exposure.indices, exposure.indptr), shape=exposure.shape))
 
 
 @njit(cache=True)
-def _believe(exposure, difference, ratios, rest):  # noqa: ANN001, ANN202
-    """Writes to ``rest`` what is taken from each exposure; below 0 where colors speak for more than geometry does."""
-    for e in range(len(exposure)):
-        p, r = OPEN_IS_SEEN * np.float64(exposure[e]), np.float64(ratios[difference[e]])
-        seen = np.float32(p * r / (p * r + 1 - p))
-        rest[e], exposure[e] = exposure[e] - seen, seen
+def _believe(exposure, holes, difference, ratios, taken):  # noqa: ANN001, ANN202
+    """Writes to ``taken`` what was, and is now, taken from each exposure; below 0 where colors speak for more than
+    geometry does. Columns ascend in each row, and what came through holes is still exposed a little."""
+    (start, column, exposed), (hole_start, hole_column, through) = exposure, holes
+    for row in range(len(start) - 1):
+        hole = hole_start[row]
+        for e in range(start[row], start[row + 1]):
+            p, r = OPEN_IS_SEEN * np.float64(exposed[e]), np.float64(ratios[difference[e]])
+            seen = np.float32(p * r / (p * r + 1 - p))
+            taken[e], exposed[e] = exposed[e] - seen, seen
+            while hole < hole_start[row + 1] and hole_column[hole] < column[e]:
+                hole += 1
+            if hole < hole_start[row + 1] and hole_column[hole] == column[e]:
+                taken[e] += through[hole]
