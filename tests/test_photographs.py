@@ -86,6 +86,20 @@ def test_cutting_changes_no_label(scene: Scene, cut: Scene, settings: FitSetting
     np.testing.assert_array_equal(whole.instances.masks, of_cut.instances.masks)
 
 
+@pytest.mark.parametrize("photographs", [8, 4])
+def test_colors_say_as_much_in_tiles(scene: Scene, photographs: int):
+    views = [replace(view, image=None if row >= photographs else view.image) for row, view in enumerate(scene.views)]
+    some, none = replace(scene, views=tuple(views)), [replace(view, image=None) for view in scene.views]
+    whole, in_tiles, without = (
+        fit(of, settings, progress=False)
+        for of, settings in ((some, SETTINGS), (some, TILED), (replace(scene, views=tuple(none)), SETTINGS))
+    )
+    assert (whole.instance_ids == in_tiles.instance_ids).mean() > 0.99
+    certainty, tiled, by_geometry = (cloud.certainty.astype(int) for cloud in (whole, in_tiles, without))
+    assert (np.abs(certainty - tiled) < 13).mean() > 0.97
+    assert (np.abs(certainty - by_geometry) > 13).mean() > 0.05
+
+
 def test_baselines_find_the_masks_of_cut_views(scene: Scene, cut: Scene):
     words = np.unique(np.concatenate([view.mask_features for view in scene.views]).round(3), axis=0)
     whole, of_cut = (center_sampling(prepare(views, SETTINGS), words) for views in (scene, cut))

@@ -38,7 +38,7 @@ from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sigh
 from og_pointcloud.fitting.membership import SceneVotes, assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
-from og_pointcloud.fitting.seen_colors import believed, differences, readable_photograph, sight_ratios
+from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, readable_photograph, sight_ratios
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
@@ -105,7 +105,7 @@ def fit_tiles(
     """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud. Returns the
     labelling of all its points, and their typical spacing.
 
-    work: keeps the points, their neighbours and what the views show (110 bytes a point, and about 25 for each view that
+    work: keeps the points, their neighbours and what the views show (110 bytes a point, and about 37 for each view that
     sees it). executor: takes tiles and views as tasks, and its workers read what they need, and write what is large, in
     the work folder; None: one after another, here.
     Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
@@ -242,19 +242,24 @@ class _Shown:
             part = np.concatenate([piece[place[piece["point"]] >= 0] for piece in pieces])
             part["point"] = place[part["point"]]
             stacks.append(_stacked(part, int(masks[view]), len(rows)))
-        of_views = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
-        weights, outside, exposure, through, difference = of_views
+        *of_views, difference = zip(*stacks, strict=True)
+        weights, outside, exposure, through = (csr_array(vstack(blocks, format="csr")) for blocks in of_views)
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
         table = MaskTable(weights, outside, exposure, *masks_of_views, doubted=through)
-        # Every exposure has its difference: both are of the same points, in the same order.
-        return self.photographs.joined(believed(table, (difference.data - 1).astype(np.uint16), self.sight_ratios))
+        return self.photographs.joined(believed(table, np.concatenate(difference), self.sight_ratios))
 
 
-def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, ...]:
-    """Weights (masks, n), and (1, n) outside, exposure, that through holes and differences of color of one view."""
+def _stacked(
+    entries: Entries, masks: int, points: int
+) -> tuple[csr_array, csr_array, csr_array, csr_array, NDArray[np.uint16]]:
+    """Of one view: weights (masks, n), and (1, n) outside, exposure and that through holes; and of each entry of the
+    exposure the difference of color."""
     matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 4, points))
-    return matrix[:masks], *(matrix[row : row + 1] for row in range(masks, masks + 4))
+    outside, exposure, through, apart = (csr_array(matrix[row : row + 1]) for row in range(masks, masks + 4))
+    # Every exposure has its difference, of the same points in the same order; or none has, without a photograph.
+    difference = apart.data - 1 if apart.nnz else np.full(exposure.nnz, NO_COLOR)
+    return csr_array(matrix[:masks]), outside, exposure, through, difference.astype(np.uint16)
 
 
 def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
@@ -335,7 +340,7 @@ def _entries(
     masks = view.mask_count
     blocks = [(front.weights, 0), (front.outside, masks), (exposure, masks + 1)]
     blocks += [] if front.doubted is None else [(front.doubted, masks + 2)]
-    blocks += [(difference, masks + 3)]
+    blocks += [] if view.image is None else [(difference, masks + 3)]
     entries = np.empty(sum(block.nnz for block, _ in blocks), ENTRY)
     end = 0
     for block, first_row in blocks:
