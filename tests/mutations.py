@@ -178,7 +178,7 @@ MUTATIONS = (
     ),
     Mutation(
         "masks compared by what holes leave of them", "fitting/grouping.py",
-        "view_votes(table.with_holes())", "view_votes(table)", ("test_grouping.py",),
+        "view_votes(table.with_doubted())", "view_votes(table)", ("test_grouping.py",),
     ),
     Mutation(
         "groups numbered by the smallest first", "fitting/grouping.py",
