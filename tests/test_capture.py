@@ -179,6 +179,11 @@ def test_language_features_are_found(capture):
     np.testing.assert_array_equal(large.mask_map(), np.where(levels[3] < 0, -1, 0))
 
 
+def test_a_mask_level_of_masks_without_levels_is_refused(capture):
+    with pytest.raises(SceneError, match=r"mask level is 'small', but the masks of .* have no levels; expected none"):
+        read_capture(capture[0], mask_level="small")
+
+
 # Resolution and distortion.
 
 
@@ -286,7 +291,9 @@ def test_frames_without_a_pose_are_left_out_aloud(capture):
     folder, _ = capture
     lost = np.full((4, 4), np.nan).tolist()
     edit_poses(folder, lambda content: content["frames"][1].update(transform_matrix=lost))
-    with pytest.warns(UserWarning, match=r"1 frames have no finite pose and are left out, e.g. 'images/frame_01.png'"):
+    with pytest.warns(
+        UserWarning, match=r"no finite pose for 1 of \d+ frames, which are left out, e.g. 'images/frame_01.png'"
+    ):
         scene = read_capture(folder)
     assert [view.name for view in scene.views] == ["frame_00", "frame_02"]
 

@@ -179,6 +179,13 @@ def test_words_a_row_are_counted(words):
         og.instance_table(room(600), words=words)
 
 
+def test_a_negative_count_of_largest_is_refused():
+    table = og.instance_table(room(600))
+    assert len(table.largest(0)) == 0
+    with pytest.raises(og.OgPointcloudError, match="count is -1; expected 0 or more"):
+        table.largest(-1)
+
+
 def test_command(bundle, tmp_path, capsys):
     assert main(["instances", str(bundle), "--up", "0,0,1", "-o", str(tmp_path / "new" / "t.csv")]) == 0
     assert capsys.readouterr().out.startswith("9 instances\nid")

@@ -152,7 +152,9 @@ class Instances(Sequence[Instance]):
         return self._rows[index]
 
     def largest(self, count: int | None = None) -> Instances:
-        """By falling number of points, of equals the smaller id first; only the first ``count``."""
+        """By falling number of points, of equals the smaller id first; only the first ``count``, 0 or more."""
+        if count is not None and count < 0:
+            raise OgPointcloudError(f"count is {count}; expected 0 or more, or None for all")
         return Instances(sorted(self._rows, key=lambda row: (-row.points, row.id))[:count])
 
     def to_records(self) -> list[dict[str, Any]]:

@@ -43,7 +43,7 @@ def add(parser: Parser) -> None:
     add_shared(parser, "--gaussians")
     option("--mode", None, "how to find instances (default: %(default)s)", choices=MODES, default=MODES[0])
     option("--schedule-share", "X", "shorten the published schedule (mode paper; default: 1)", type=float)
-    option("--mask-level", None, "of LangSplat masks (default: %(default)s)", choices=MASK_LEVELS, default="large")
+    option("--mask-level", None, "of LangSplat masks (default: large)", choices=MASK_LEVELS)
     option("--vocabulary", "F.npz", "words that can be asked (default: the capture's text_features.npz)", type=Path)
     bank = "50 everyday words or more to judge labels by (default: the capture's word_bank.npz, else the encoder's)"
     option("--word-bank", "F.npz", bank, type=Path)

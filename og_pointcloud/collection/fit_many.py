@@ -37,13 +37,13 @@ LOST = "lost"
 class FitOptions:
     """How captures are read and fitted: arguments of `read_capture`, `fit` and `scene_words`.
 
-    >>> og.FitOptions(og.FitSettings(mode="grouping")).mask_level
-    'large'
+    >>> og.FitOptions(og.FitSettings(mode="grouping")).settings.mode
+    'grouping'
     """
 
     settings: FitSettings = field(default_factory=FitSettings)
     gaussians: str | Path | None = None
-    mask_level: Literal["default", "small", "medium", "large"] = "large"
+    mask_level: Literal["default", "small", "medium", "large"] | None = None
     text_features: StrPath | None = None
     word_bank: StrPath | None = None
 

@@ -84,13 +84,14 @@ class CapturePoses:
 def read_capture(
     folder: str | Path,
     gaussians: str | Path | None = None,
-    mask_level: str = "large",
+    mask_level: str | None = None,
     repairs: Sequence[str] | None = None,
 ) -> Scene:
     """Read a capture folder.
 
     gaussians: a cloud or 3DGS file to use instead of the folder's own geometry.
-    mask_level: of LangSplat's masks: default, small, medium or large (the paper's).
+    mask_level: of LangSplat's masks: default, small, medium or large (the paper's, and what None is). Masks of other
+        formats have no levels: SceneError where one is given.
     repairs: of mistakes in the files, such as "axes=flipped" (formats/repairs.py lists them); left out, those that the
         folder's ``repairs.json`` names, which `og-pointcloud repair` writes.
 
@@ -169,7 +170,8 @@ def _stated_poses(capture: Path) -> CapturePoses:
         source, frames, is_recording = capture, _recording(capture), True
     if frames.dropped:
         warnings.warn(
-            f"{source}: {len(frames.dropped)} frames have no finite pose and are left out, e.g. "
+            f"{source}: no finite pose for {len(frames.dropped)} of {len(frames.dropped) + len(frames.images)} frames, "
+            "which are left out, e.g. "
             f"'{printable(frames.dropped[0], 80)}'",
             stacklevel=4,
         )
@@ -237,7 +239,7 @@ def _has_mask(capture: Path, name: str) -> bool:
     return any((capture / file).is_file() for file in files)
 
 
-def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLayer], str]:
+def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list[MaskLayer], str]:
     """The masks of each view, and the name of their feature space. Masks of a whole image are split with it."""
     faces = [image.face for image in poses.images]
     # The name that each view's masks are stored under: of a cube's face without masks of its own, the image's.
@@ -284,11 +286,16 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     return MaskLayer(size, layer.features[used], lambda: np.repeat(rows, lengths).reshape(shape), tracks, cut)
 
 
-def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
+def _read_masks(capture: Path, names: Sequence[str], level: str | None) -> tuple[list[MaskLayer], str]:
     if (capture / FEATURES_NAME).is_file():
+        if level is not None:
+            raise SceneError(
+                f"mask level is '{level}', but the masks of {capture} ({FEATURES_NAME}) have no levels; expected none: "
+                f"leave it out, or move {FEATURES_NAME} away to read {LANGUAGE_FEATURES_FOLDER}/ where there is one"
+            )
         return read_masks(capture, names)
     if (capture / LANGUAGE_FEATURES_FOLDER).is_dir():
-        return read_language_features(capture, names, level)
+        return read_language_features(capture, names, "large" if level is None else level)
     found = f"{MASKS_FOLDER}/ but no {FEATURES_NAME}" if (capture / MASKS_FOLDER).is_dir() else "no masks at all"
     raise SceneError(
         f"{capture} has {found}; expected {MASKS_FOLDER}/<image stem>.png (ids) with {FEATURES_NAME}, or LangSplat's "
