@@ -20,6 +20,10 @@ class LeftOut(Enum):
 
     # fmt: off
     COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another lies, and get its label"
+    SHAPES = (
+        "shapes of Gaussians", "scale, rotation and opacity of the Gaussians",
+        "views are asked along the ray of each one's center",
+    )
     CHOICE_OF_SPLATS = "choice of splats", "choice of scale and opacity", "the file holds Gaussians"
     CHOICE_OF_SCALE = (
         "choice of scale", "choice of the points' size",

@@ -214,19 +214,20 @@ def test_masks_may_be_read_when_needed(known: Known, labelled: LabelledCloud) ->
     np.testing.assert_array_equal(fit(scene, progress=False).instance_ids, labelled.instance_ids)
 
 
-def test_gaussians_are_taken_as_they_are(known: Known) -> None:
-    points = known.scene.points
+def test_shapes_of_gaussians_do_not_matter(known: Known, labelled: LabelledCloud) -> None:
+    """However a training drew them: faint, large, long."""
+    points, rng = known.scene.points, np.random.default_rng(0)
     n = len(points)
+    rotation = rng.normal(size=(n, 4))
     gaussians = replace(
         points,
-        scale=np.full((n, 3), 0.4 * SPACING, np.float32),
-        rotation=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        opacity=np.full(n, 0.9, np.float32),
+        scale=SPACING * rng.lognormal(0, 1, (n, 3)).astype(np.float32),
+        rotation=(rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).astype(np.float32),
+        opacity=rng.random(n, np.float32),
     )
     cloud = fit(replace(known.scene, points=gaussians), progress=False)
-    assert share_right(cloud, known.truth) > 0.95
-    assert "choice of scale and opacity" in {entry["what"] for entry in cloud.provenance["left_out"]}
-    assert "gaussian_scale" not in cloud.provenance["notes"]
+    np.testing.assert_array_equal(cloud.instance_ids, labelled.instance_ids)
+    assert "scale, rotation and opacity of the Gaussians" in {entry["what"] for entry in cloud.provenance["left_out"]}
 
 
 @pytest.mark.slow

@@ -175,8 +175,8 @@ def _check(scene: Scene, journal: Journal) -> None:
 
 
 def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
-    """The surface with a plain cloud's points drawn as large as held-out views find best."""
-    # Trained Gaussians have their size; mode paper draws points as full as those.
+    """The surface with points drawn as large as held-out views find best."""
+    # Mode paper draws points as full as trained Gaussians are.
     if not surface.by_sight:
         return surface
     points = surface.scene.points

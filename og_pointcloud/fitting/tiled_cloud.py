@@ -77,14 +77,14 @@ class TiledCloud:
 
     def __init__(self, work: WorkFolder, key: str) -> None:
         self.work, self.key = work, key
-        order, start, self.margins, ends, members, xyz, origin, rgb, *gaussian = work.arrays("cloud", key, vanished)
-        self.tiles, self.points = Tiles(order, start), Points(xyz, origin, rgb if len(rgb) else None, *gaussian)
+        order, start, self.margins, ends, members, xyz, origin, rgb = work.arrays("cloud", key, vanished)
+        self.tiles, self.points = Tiles(order, start), Points(xyz, origin, rgb if len(rgb) else None)
         self.members = tuple(members[first:last] for first, last in pairwise(ends.tolist()))
 
     @classmethod
     def cut(cls, points: Points, most: int, settings: FitSettings, work: WorkFolder) -> TiledCloud:
         """Tiles of at most so many points, and what lies about them."""
-        key = fingerprint(points.xyz, points.rgb, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
+        key = fingerprint(points.xyz, points.rgb, settings, most, MARGIN)
 
         def arrays() -> list[NDArray[Any]]:
             tiles = split(points.xyz, most)
@@ -93,10 +93,8 @@ class TiledCloud:
             margins = [MARGIN * _sparse_spacing(ordered.xyz[part]) for part in parts]
             members = [_within(ordered.xyz, part, margin) for part, margin in zip(parts, margins, strict=True)]
             # A file holds a flat list of arrays: members of all tiles in one, colors empty where there are none.
-            ends, shape = np.cumsum([0, *map(len, members)]), (ordered.scale, ordered.rotation, ordered.opacity)
-            known = [array for array in shape if array is not None]
-            rgb = np.zeros((0, 3), np.uint8) if ordered.rgb is None else ordered.rgb
-            cloud = (ordered.xyz, ordered.origin, rgb, *known)
+            ends, rgb = np.cumsum([0, *map(len, members)]), ordered.rgb
+            cloud = ordered.xyz, ordered.origin, np.zeros((0, 3), np.uint8) if rgb is None else rgb
             return [tiles.order, tiles.start, np.array(margins), ends, np.concatenate(members), *cloud]
 
         work.arrays("cloud", key, arrays)

@@ -54,7 +54,7 @@ from og_pointcloud.rendering.geometry import (
     sample_of_points,
 )
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
-from og_pointcloud.rendering.surface import sight_thickness, surface_thickness, with_distinct_points
+from og_pointcloud.rendering.surface import sight_thickness, with_distinct_points
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
@@ -178,30 +178,23 @@ def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class _Drawing:
-    """How points are drawn, the same in every tile. scale, opacity: of a plain cloud's splats, scale in spacings; None
-    for Gaussians. near, typical: depth of the near plane and the cloud's typical spacing, scene units."""
+    """How points are drawn, the same in every tile. scale, opacity: of their splats, scale in spacings. near, typical:
+    depth of the near plane and the cloud's typical spacing, scene units."""
 
-    scale: float | None
-    opacity: float | None
+    scale: float
+    opacity: float
     near: float
     typical: float
 
     def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
         """Splats of some points, each ``larger`` times as large as it would be."""
-        chosen = cloud.points.take(rows)
-        if self.scale is None or self.opacity is None:
-            splats = Gaussians.from_points(chosen)
-            return replace(splats, scale=splats.scale * larger[:, None])
-        return isotropic(chosen, cloud.drawn_spacing[rows] * larger, self.scale, self.opacity)
+        return isotropic(cloud.points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, self.opacity)
 
 
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
     """Size and opacity of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, (view.camera for view in views)), float(np.median(cloud.spacing))
-    if points.are_gaussians:
-        journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
-        return _Drawing(None, None, near, typical)
     few, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
     if len(points) > CHOICE_POINTS:
         journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
@@ -326,9 +319,8 @@ def _entries(
     if len(rows) == 0:
         return np.zeros(0, ENTRY), counts, np.zeros((2, DIFFERENCES))
     splats = drawing.splats(cloud, rows, larger)
-    apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
-    thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
-    table = mask_table(splats, [view], drawing.near, thickness, by_sight=by_sight)
+    thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
+    table = mask_table(splats, [view], drawing.near, thickness, by_sight=True)
     camera = view.camera
     front, _ = without_see_through(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
@@ -373,15 +365,14 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
     to fall to ALPHA_MIN. The projection is linearized within a margin of the image: there a round one is widened.
     """
-    points, spacing, drawn = cloud.points, cloud.spacing[part], cloud.drawn_spacing[part]
-    widest = drawn * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
+    points, spacing, size_of = cloud.points, cloud.spacing[part], drawing.scale * cloud.drawn_spacing[part]
     with np.errstate(divide="ignore", invalid="ignore"):
         uv_px, depth = camera.project(points.xyz[part])
         focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
         size = np.array([camera.width, camera.height])
         # The steepest slope that a projection is linearized at; there a sphere's image is longest, sqrt(1 + slope^2).
         slope = (np.maximum(center, size - center) + 0.5 * FRUSTUM_MARGIN * size) / focal
-        own_px = focal * np.sqrt(1 + slope**2) * (widest / depth)[:, None]
+        own_px = focal * np.sqrt(1 + slope**2) * (size_of / depth)[:, None]
         reach_px = np.sqrt(-2 * np.log(ALPHA_MIN)) * (own_px + np.sqrt(LOW_PASS)) + 1
         shows = (depth > drawing.near) & ((uv_px > -reach_px) & (uv_px < size + reach_px)).all(axis=1)
     inside = np.flatnonzero(shows)

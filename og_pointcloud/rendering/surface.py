@@ -21,7 +21,7 @@ from og_pointcloud.rendering.geometry import (
     thinned,
 )
 from og_pointcloud.rendering.splatting import Gaussians
-from og_pointcloud.scene import Scene, View
+from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
 
@@ -29,15 +29,15 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (Gaussians all stay), in order of place. n below is the number of its points.
+    scene: with one point per position (in mode paper Gaussians all stay), in order of place. n below is the number of its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in their order.
     neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
     stride: every stride-th row and column of the images is used; 1 but in mode paper.
-    by_sight: a view tells which mask a point lies in along the point's own ray (sightings.py), as for plain clouds,
-    whose Gaussians are of our making; else how much each Gaussian paints of each mask (splatting.py), as in the paper.
+    by_sight: a view tells which mask a point lies in along the point's own ray (sightings.py); else, in mode paper, how
+    much each Gaussian paints of each mask (splatting.py).
     """
 
     scene: Scene
@@ -60,33 +60,37 @@ class Surface:
 
 def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -> Surface:
     """Find the points that are needed, their spacing, and the Gaussians that they are drawn as."""
-    scene, row_of_point = with_distinct_points(scene, journal)
+    is_paper = settings.mode == "paper"
+    row_of_point = None
+    if not (is_paper and scene.points.are_gaussians):  # how these overlap is part of how they look
+        scene, row_of_point = with_distinct_points(scene, journal)
     with journal.stage("spacing"):
         scene, row_of_point = _in_order_of_place(scene, row_of_point)
-        if settings.mode != "paper":  # which has a choice of its own: so many steps, a view each
+        if not is_paper:  # which has a choice of its own: so many steps, a view each
             scene = with_needed_views(scene, settings.geometry.enough_views, journal)
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, settings, journal)
-        by_sight = not scene.points.are_gaussians and settings.mode != "paper"
         spacing, typical = around.spacing, float(np.median(around.spacing))
-        thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=by_sight)
+        thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=not is_paper)
         # Only mode paper renders a view more than once.
-        is_paper = settings.mode == "paper"
         stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal) if is_paper else 1
-    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
+    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, not is_paper)
 
 
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
     """The scene with one point per position, and for each of its points the row that stands for it; None if all differ.
+    Of two points at the same position one would hide the other, which would then seem unseen.
 
-    Of two points at the same position one would hide the other, which would then seem unseen. Gaussians all stay: how
-    they overlap is part of how the scene looks.
+    Gaussians are points at their centers: their shapes are made to look right together, not to say where a surface is.
+    Drawn as trained they let rays through where they are faint, and hide what lies beside them where they are large.
     """
     points = scene.points
     if points.are_gaussians:
-        return scene, None
+        journal.leave_out(LeftOut.SHAPES)
+        points = Points(points.xyz, points.origin, points.rgb)
+        scene = replace(scene, points=points)
     first, row_of_point = distinct_places(points.xyz)
     if len(first) == len(points):
         return scene, None
@@ -104,7 +108,7 @@ def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> 
 
 
 def _gaussians(scene: Scene, around: Neighbourhood, settings: FitSettings, journal: Journal) -> Gaussians:
-    """The file's own Gaussians; of a plain cloud round ones, whose size `held_out` may change later."""
+    """Round Gaussians, whose size `held_out` may change later; in mode paper the file's own, if it has some."""
     if scene.points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return Gaussians.from_points(scene.points)
