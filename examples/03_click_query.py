@@ -48,3 +48,4 @@ for row in scene.instances.largest():
         print(f"click at {pixel}: {clicks[-1]}, {clicks[-1].words()[:3]}")
         break
 plotter.screenshot(arguments.output / "after.png")
+print(f"wrote {arguments.output}/before.png and after.png")

@@ -34,7 +34,7 @@ mesh: Any = result.to_pyvista()
 unsure: Any = mesh.copy()
 unsure["og_label"] = np.where(sure, result.labels, -1)  # what is not sure becomes unknown
 plotter: Any = pv.Plotter(off_screen=True, window_size=[1800, 900], shape=(1, 2))
-bar = {"title": "certainty", "vertical": True, "fmt": "%.1f"}
+bar = {"title": "certainty", "vertical": True, "fmt": "%.1f", "n_labels": 3}
 plotter.add_mesh(pv.PolyData(mesh.points), scalars=result.certainty, clim=(0, 1), point_size=4, scalar_bar_args=bar)
 plotter.subplot(0, 1)
 plotter.og.add_segmentation(unsure, point_size=4, names=False)
@@ -42,3 +42,4 @@ plotter.add_text(f"labels of certainty {arguments.at_least:g} and more", font_si
 plotter.link_views()
 plotter.og.show_labelled(unsure)
 plotter.screenshot(arguments.output / "how_sure.png")
+print(f"wrote {arguments.output}/how_sure.png")

@@ -105,7 +105,7 @@ for name, cloud in clouds.items():
     if click.found:
         gone, painted = (out / f"{name.replace(' ', '_')}_{what}.ply" for what in ("gone", "painted"))
         og.edit.remove(cloud, click, gone, cloud=before, halo=3)
-        og.edit.recolour(cloud, click, painted, (40, 70, 220), cloud=before)
+        og.edit.recolor(cloud, click, painted, (40, 70, 220), cloud=before)
         panels += [draw(og.read_points(file), camera, near=surface.near) for file in (gone, painted)]
         lit = click.mask(camera)[:, :, None]
         panels[0] = np.where(lit, 0.4 * panels[0] + [138, 24, 36], 0.35 * panels[0] + 150).astype(np.uint8)

@@ -56,12 +56,19 @@ def first_line(error: BaseException) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
-    """Part of a message that names known words like this one, followed by ``then``; "" where there are none."""
+    """Part of a message that names known words like this one, followed by ``then``; "" where there are none.
+
+    >>> from og_pointcloud.errors import did_you_mean
+    >>> did_you_mean("table", ["apple", "dining table"]), did_you_mean("aple", ["apple", "dining table"])
+    ("; did you mean 'dining table'?", "; did you mean 'apple'?")
+    """
     import difflib  # only when something went wrong
 
     # Case is the usual slip, and difflib would count each letter of it.
-    by_lower = {name.lower(): name for name in known}
-    close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
+    word, by_lower = word.lower(), {name.lower(): name for name in known}
+    # A dining table is more of a table than an apple is.
+    parts = [name for name in by_lower if word in name.split() or name in word.split()]
+    close = [by_lower[match] for match in (parts or difflib.get_close_matches(word, by_lower))[:3]]
     return f"; did you mean {' or '.join(repr(name) for name in close)}?{then}" if close else ""
 
 

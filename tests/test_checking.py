@@ -559,6 +559,7 @@ def test_the_commands_tell_a_fault_repair_it_and_take_the_repair_back(tmp_path, 
     assert main(["repair", str(folder)]) == 0
     assert json.loads((folder / "repairs.json").read_text()) == {"repairs": ["axes=flipped"]}
     assert "axes=sideways" in error_of(capsys, "repair", folder, "axes=sideways")
+    assert "nothing was found that needs a repair" in output_of(capsys, "repair", folder)
 
 
 def test_a_repaired_capture_is_the_right_one(tmp_path):

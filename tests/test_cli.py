@@ -112,6 +112,22 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
 
 
+def test_the_next_command_asks_for_what_is_there(tiny_capture, tmp_path, capsys):
+    """A list of words may begin with an airplane, and without a bank every instance would be one."""
+    file = tiny_capture.folder / "text_features.npz"
+    stored = dict(np.load(file))
+    unused_first = {name: stored[name][::-1] for name in ("names", "vectors")}
+    np.savez(file, **{**stored, **unused_first})
+    stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
+    command = shlex.split(next(line for line in stdout.splitlines() if line.startswith("next: ")))
+    assert set(command[command.index("--labels") + 1].split(",")) == set(NAMES)
+
+
+def test_nothing_is_proposed_where_no_point_has_a_label(fitted, tmp_path, capsys):
+    write_ply(tmp_path / "far.ply", np.full((5, 3), 500.0), np.zeros((5, 3), np.uint8))
+    assert "next: " not in output_of(capsys, "segment", fitted[1], "--points", tmp_path / "far.ply")
+
+
 def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsys):
     (tiny_capture.folder / "text_features.npz").unlink()
     stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")

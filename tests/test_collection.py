@@ -392,6 +392,7 @@ def test_commands(folder, capsys, tmp_path):
     out, err = capsys.readouterr()
     assert "2 added" in out
     assert "2 scenes with 3 instances" in out
+    assert out.splitlines()[-1].split()[-1] in ("chair", "mug"), "not 'bed', the first of all words"
     assert "broken is left out" in err
     (folder / "one").mkdir()
     og.write_bundle(scene(["desk"], 1), folder / "one" / "room.ogpc")
@@ -405,6 +406,8 @@ def test_commands(folder, capsys, tmp_path):
     assert len(records) == 3
     text = page.read_text()
     assert text.count("data:image/png;base64,") == 3
+    assert ("1 of these 3 fit" in text, text.count("class=misfit")) == (True, 2)
+    assert "1 of these 3 fit" in output_of(capsys, "find", atlas, "mug")
     assert "room1" in output_of(capsys, "find", atlas, "mug", "--scene", "room1", "--top", "1")
     assert "nothing was found" in output_of(capsys, "find", atlas, "mug", "--within", "5,5,5,6,6,6")
     for scenes, says in (("room0", False), ("room1", True)):  # the latter has a desk alone

@@ -226,9 +226,9 @@ def some_directions(count=20):
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def test_recoloured_splats_shine_in_the_new_colour_from_everywhere(scene, splats, tmp_path):
+def test_recolored_splats_shine_in_the_new_colour_from_everywhere(scene, splats, tmp_path):
     rows, mine = vertices(splats), scene.instance_ids == 3
-    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (200, 100, 20), cloud=splats)
+    done = og.edit.recolor(scene, 3, tmp_path / "out.ply", (200, 100, 20), cloud=splats)
     after = vertices(done.path)
     np.testing.assert_array_equal(after[~mine], rows[~mine])
     for name in set(rows.dtype.names) - {*BASE, *(f"f_rest_{k}" for k in range(45))}:
@@ -239,13 +239,13 @@ def test_recoloured_splats_shine_in_the_new_colour_from_everywhere(scene, splats
     np.testing.assert_allclose(now, (before @ luminance)[..., None] / mean * color, atol=1e-5)
 
 
-def test_recoloured_plain_cloud(scene, tmp_path):
+def test_recolored_plain_cloud(scene, tmp_path):
     random, mine = np.random.default_rng(0), scene.instance_ids == 3
     grey = random.integers(60, 180, len(scene.xyz))
     rgb = dict.fromkeys(("red", "green", "blue"), grey.astype(np.uint8))
     normals = {name: random.normal(size=len(grey)).astype(np.float32) for name in ("nx", "ny", "nz")}
     source = plain_file(tmp_path / "plain.ply", scene.xyz.astype(np.float32), **normals, **rgb)
-    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (250, 0, 120), cloud=source)
+    done = og.edit.recolor(scene, 3, tmp_path / "out.ply", (250, 0, 120), cloud=source)
     after, rows = vertices(done.path), vertices(source)
     np.testing.assert_array_equal(after[~mine], rows[~mine])
     assert after.dtype == rows.dtype
@@ -259,7 +259,7 @@ def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_pa
     half = dict.fromkeys(("r", "g", "b"), np.linspace(0, 1, n).astype(np.float32))
     for columns, others in ((half, np.rint(np.linspace(0, 255, n))), ({}, np.full(n, 128))):
         source = plain_file(tmp_path / "plain.ply", scene.xyz, **columns)
-        done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (90, 80, 70), cloud=source)
+        done = og.edit.recolor(scene, 3, tmp_path / "out.ply", (90, 80, 70), cloud=source)
         rgb = og.read_points(done.path).rgb
         np.testing.assert_allclose(rgb[~mine], np.repeat(others[~mine, None], 3, axis=1), atol=1)
         np.testing.assert_allclose(rgb[mine].mean(axis=0), [90, 80, 70], atol=1)
@@ -269,7 +269,7 @@ def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_pa
 @pytest.mark.parametrize("color", [(1, 2), (1, 2, 256), (-1, 0, 0), (np.nan, 0, 0)])
 def test_a_colour_that_is_none_is_refused(scene, tmp_path, color):
     with pytest.raises(OgPointcloudError, match="0 to 255"):
-        og.edit.recolour(scene, 3, tmp_path / "out.ply", color)
+        og.edit.recolor(scene, 3, tmp_path / "out.ply", color)
 
 
 # Insertion --------------------------------------------------------------------------------------------------------
@@ -428,11 +428,11 @@ def test_commands(scene, splats, tmp_path, capsys):
     assert "points removed (instances 3, 5)" in capsys.readouterr().out
     assert edit("extract", bundle, f"--xyz={place}", "--cloud", splats, "-o", tmp_path / "two.ply") == 0
     assert "points extracted (instance 2)" in capsys.readouterr().out
-    assert edit("recolour", bundle, "--word", WORDS[1], "--color", "90,80,70", "-o", tmp_path / "c.ply") == 0
-    recoloured = og.read_points(tmp_path / "c.ply").rgb[
+    assert edit("recolor", bundle, "--word", WORDS[1], "--color", "90,80,70", "-o", tmp_path / "c.ply") == 0
+    recolored = og.read_points(tmp_path / "c.ply").rgb[
         np.isin(scene.instance_ids, og.select(scene, WORDS[1]).instances)
     ]
-    brightness = recoloured.mean(axis=0) / [90, 80, 70]  # of a nearly black object: the hue is the new one, in the dark
+    brightness = recolored.mean(axis=0) / [90, 80, 70]  # of a nearly black object: the hue is the new one, in the dark
     np.testing.assert_allclose(brightness, brightness.mean(), rtol=0.03)
 
 
@@ -465,6 +465,6 @@ def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
     for words, message in (
         (["remove", str(bundle), "--id", "one", "-o", out], "--id is 'one'"),
         (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "a file that is read"),
-        (["recolour", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
+        (["recolor", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
     ):
         assert message in error_of(capsys, "edit", *words)

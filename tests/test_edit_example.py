@@ -1,4 +1,4 @@
-"""Example 08: what is removed is gone, what is recoloured is red, what is inserted is there, in the files and seen."""
+"""Example 08: what is removed is gone, what is recolored is red, what is inserted is there, in the files and seen."""
 
 import runpy
 import sys
@@ -36,7 +36,7 @@ def near(points, middle):
 def test_scene_is_edited_by_words(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["example", str(things(tmp_path / "room.ogpc")), "-o", str(tmp_path)])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
-    assert "removed 2 instances, recoloured 1" in capsys.readouterr().out
+    assert "removed 2 instances, recolored 1" in capsys.readouterr().out
     before, removed, red, inserted = (
         og.read_points(tmp_path / f"{n}.ply") for n in ("before", "removed", "red", "inserted")
     )

@@ -442,6 +442,8 @@ def test_the_commands_write_what_changed(monday, friday, tmp_path, capsys):
     assert main(["compare", str(one), str(other), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == og.compare(monday, friday).to_dict()
+    assert main(["compare", str(one), str(other)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith("--html changes.html")
 
 
 def test_memory_does_not_grow_with_the_square_of_the_instances():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
+from og_pointcloud.cli.common import print_next
 from og_pointcloud.cloud import Vocabulary, WordBank
 from og_pointcloud.evaluate.baselines import direct_uplift
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
@@ -211,5 +212,7 @@ def _report(demo: DemoResult) -> None:
     print(f"wrote {demo.bundle} ({demo.bundle.stat().st_size / 1e6:.1f} MB)")
     for picture in demo.pictures:
         print(f"wrote {picture}")
-    words = "chair,mug,potted plant"
-    print(f'total {sum(demo.seconds.values()):.1f} s; next: og-pointcloud segment {demo.bundle} --labels "{words}"')
+    print(f"total {sum(demo.seconds.values()):.1f} s")
+    print_next("segment", demo.bundle, "--labels", "chair,mug,potted plant")
+    if (typed := demo.output / "photographs" / "room.ogpc").is_file():
+        print_next("select", typed, "coffee mug", hint="or, in words of your own: ")

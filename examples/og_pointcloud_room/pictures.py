@@ -22,11 +22,11 @@ CUT_M = 2.3
 """Points above are cut away, so that one sees into the room; metres above the floor."""
 WALL_M = 0.15
 """What lies nearer than this to the end of the room is a wall, or hangs on one."""
-STEP_BACK = 1.4
+STEP_BACK = 1.15
 """Of the eye, so that walls and what hangs on them are in the picture too."""
 DRAWN_SIZE, PICTURE_WIDTH = (1600, 1000), 1000
 """Pixels as drawn; and across, as shown."""
-CLOSED = 3.0
+CLOSED = 4.5
 """Width of a point in point spacings, so that surfaces close; smoothing halves it."""
 ASIDE = 0.12
 """How far the scene is moved to the left, in half widths: the legend is on the right."""

@@ -61,13 +61,13 @@ class Once(argparse.Action):
 SHARED: dict[str, dict[str, Any]] = {
     "capture": {"type": Path, "metavar": "CAPTURE", "help": "folder with images and poses"},
     "bundle": {"type": Path, "metavar": "S.ogpc", "help": "what `fit` wrote"},
-    "--labels": {"metavar": "A,B,C", "help": 'names to choose among; of commas, "in, quotes" (default: all known)'},
+    "--labels": {"metavar": "A,B,C", "help": 'names to choose among; "a, b" is one name (default: all known)'},
     "--text-features": {
         "type": Path, "metavar": "F.npz",
         "help": "names and vectors, from the scene's encoder (default: the scene's own words)",
     },
     "--gaussians": {"type": Path, "metavar": "F.ply", "help": "geometry, in place of the capture's own"},
-    "--cloud": {"type": Path, "metavar": "CLOUD", "help": "other points or splats of it (default: those fitted)"},
+    "--cloud": {"type": Path, "metavar": "CLOUD", "help": "other points or splats of the place (default: the scene's)"},
     "--up": {"metavar": "AXIS", "help": "what points up: x, y, z, -x, -y, -z or X,Y,Z (in pictures z by default)"},
     "--frame": {"default": "map", "metavar": "F", "help": "what tf calls the frame of the map (default: %(default)s)"},
     "--json": {"action": "store_true", "help": "print the result as JSON"},
@@ -230,11 +230,21 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")
     output = report["output"]
     if cloud.vocabulary or find_encoder(cloud.feature_space, carried_encoder(output)):
-        labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
+        labels = likely_words(cloud) if cloud.vocabulary else ("chair", "table")
         print_next("segment", output, "--labels", as_option(labels), "-o", labels_file(output))
     else:
         print("no words are known yet: segment takes --text-features, or what export text makes of the masks' encoder")
         print_next("instances", output)
+
+
+def likely_words(cloud: LabelledCloud) -> list[str]:
+    """Two words that the largest instances of a cloud with a vocabulary fit best, or its first two: words of a data
+    set's list that fit nothing would label everything where there is no word bank."""
+    from og_pointcloud.ask.labelled_scene import LabelledScene
+
+    largest = LabelledScene.from_cloud(cloud).instances.largest()
+    best = dict.fromkeys(row.words[0][0] for row in largest if row.points and row.words)
+    return list(best)[:2] or list(cloud.vocabulary.names[:2] if cloud.vocabulary else ())
 
 
 def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:

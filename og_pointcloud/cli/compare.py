@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, direction, print_result
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, direction, print_next, print_result
 from og_pointcloud.cli.update import print_changes
 from og_pointcloud.errors import OgPointcloudError
 
@@ -36,5 +36,9 @@ def run(arguments: argparse.Namespace) -> None:
         up = np.array(direction(arguments.up or "z"), np.float64)
         write_changes_page(arguments.html, before.cloud, after.cloud, changes, up)
     print_result(arguments, changes.to_dict(), lambda _: print_changes(changes))
-    if arguments.html and not arguments.json:
+    if arguments.json:
+        return
+    if arguments.html:
         print(f"wrote {arguments.html}")
+    elif any(changes.to_dict().values()):
+        print_next("compare", arguments.before, arguments.after, "--html", "changes.html", hint="to see it: ")

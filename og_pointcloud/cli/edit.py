@@ -1,4 +1,4 @@
-"""Remove, extract or recolour objects; write a .ply that other viewers open.
+"""Remove, extract or recolor objects; write a .ply that other viewers open.
 
 og-pointcloud edit remove kitchen.ogpc --word "red mug" --cloud kitchen.ply -o without.ply
 """
@@ -17,18 +17,18 @@ from og_pointcloud.errors import OgPointcloudError, counted
 if TYPE_CHECKING:
     from og_pointcloud.show.edit import What
 
-VERBS = {"remove": "removed", "extract": "extracted", "recolour": "recoloured"}
+VERBS = {"remove": "removed", "extract": "extracted", "recolor": "recolored"}
 SUMMARIES = {
     "remove": "Write the cloud without an object.",
     "extract": "Write an object alone.",
-    "recolour": "Write the cloud with an object recoloured.",
+    "recolor": "Write the cloud with an object recolored.",
 }
 
 
 def add(parser: Parser) -> None:
     operations = parser.add_subparsers(dest="operation", required=True, metavar="OPERATION")
     for name, summary in SUMMARIES.items():
-        color = " --color 40,70,220" if name == "recolour" else ""
+        color = " --color 40,70,220" if name == "recolor" else ""
         example = f'og-pointcloud edit {name} kitchen.ogpc --word "red mug"{color} --cloud kitchen.ply -o edited.ply'
         operation = common.add_command(operations, name, run, f"{summary}\n\n{example}")
         common.add_shared(operation, "bundle", "--text-features", "--cloud", "--json")
@@ -40,13 +40,13 @@ def add(parser: Parser) -> None:
         common.add_option(operation, "--halo", "N", near, type=float, default=0.0)
         endings, help = (".ply", ".spz"), "the edited cloud; .spz of splats"
         common.add_output(operation, "-o", "--output", endings=endings, required=True, help=help)
-    common.add_option(operations.choices["recolour"], "--color", "R,G,B", "0 to 255 each", required=True)
+    common.add_option(operations.choices["recolor"], "--color", "R,G,B", "0 to 255 each", required=True)
 
 
 def run(arguments: argparse.Namespace) -> None:
     scene = og.load(arguments.bundle)
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
-    if arguments.operation == "recolour":
+    if arguments.operation == "recolor":
         options["color"] = common.numbers(arguments.color, "--color", 3)
     done = getattr(og.edit, arguments.operation)(scene, what_to_edit(arguments), arguments.output, **options)
     record: dict[str, Any] = {"output": str(done.path), "operation": arguments.operation, "points": done.points}

@@ -54,8 +54,10 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if findings:
         common.print_table(("scene", "instance", "word", "score", "center", "size"), list(map(cells, findings)))
-        if not any(finding.fits for finding in findings):
+        if not (fitting := sum(finding.fits for finding in findings)):
             print("nothing fits what was asked: no score is above one half")
+        elif fitting < len(findings):
+            print(f"{fitting} of these {len(findings)} fit: their scores are above one half")
     else:
         print("nothing was found there: no instance with a feature has its middle in the box")
     if not all(finding.calibrated for finding in findings):

@@ -1,7 +1,7 @@
 """Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file; or many folders, on many workers.
 
 og-pointcloud fit kitchen -o kitchen.ogpc
-  og-pointcloud fit scans/* --out fitted --scheduler tcp://10.0.0.1:8786
+og-pointcloud fit scans/* --out fitted --scheduler tcp://10.0.0.1:8786
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def add(parser: Parser) -> None:
     option("capture", "CAPTURE", "folder with images and poses; several with --out", type=Path, nargs="+")
     target = parser.add_mutually_exclusive_group(required=True)
     add_output(target, "-o", "--output", endings=(".ogpc",), help="the file to write")
-    add_option(target, "--out", "DIR", "for DIR/NAME.ogpc of each capture, but those that are there", type=replaceable)
+    add_option(target, "--out", "DIR", "a folder for NAME.ogpc of each capture that has none there", type=replaceable)
     option("--scheduler", "ADDRESS", "of a Dask cluster for captures, or tiles of one (default: this machine)")
     add_shared(parser, "--gaussians")
     option("--mode", None, "how to find instances (default: %(default)s)", choices=MODES, default=MODES[0])
@@ -50,7 +50,7 @@ def add(parser: Parser) -> None:
     option("--seed", "N", "of everything random (default: %(default)s)", type=int, default=0)
     option("--memory", "4GB", "a larger table of masks goes to disk (default: half of what is free)")
     option("--tile-points", "N", "fit in tiles of so many points (default: where one fit would not fit)", type=int)
-    option("--work", "DIR", "keeps views, for a start after a kill (default: S.ogpc.work)", type=replaceable)
+    option("--work", "DIR", "keeps views, so that a killed fit goes on (default: OUT.ogpc.work)", type=replaceable)
     add_output(parser, "--rerun", endings=(".rrd",), help="also write the views and what they show for Rerun's viewer")
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, print_next, replaceable
-from og_pointcloud.errors import counted, printable
+from og_pointcloud.errors import OgPointcloudError, counted, printable
 
 
 def add(parser: Parser) -> None:
@@ -37,4 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
         write_lance(arguments.output, arguments.lance)
         print(f"wrote {arguments.lance}")
     if collection.words:
-        print_next("find", arguments.output, collection.words[0])
+        # What the largest scene fits best: the first word of a data set's list may be an airplane.
+        largest = max(collection.entries, key=lambda entry: entry.instances)
+        with suppress(OgPointcloudError):  # no word is known in its feature space
+            for finding in collection.find(collection.words, scenes=largest.name, top=1):
+                print_next("find", arguments.output, finding.word)

@@ -23,7 +23,7 @@ def add(parser: Parser) -> None:
     option("--start", "MAP.ogpc", "a map to go on with (default: an empty one)", type=Path)
     add_shared(parser, "--frame")
     option("--feature-space", "NAME", "encoder of the features (default: %(default)s)", default="unknown")
-    option("--work", "DIR", "where the map is kept while it grows (default: S.ogpc.map)", type=replaceable)
+    option("--work", "DIR", "where the map is kept while it grows (default: OUT.ogpc.map)", type=replaceable)
 
 
 def run(arguments: argparse.Namespace) -> None:

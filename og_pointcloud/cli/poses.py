@@ -1,4 +1,4 @@
-"""Find the poses of photographs, and points, by structure from motion: a capture for `masks`. A help, not a promise.
+"""Turn photographs without poses into a capture for `masks`, by structure from motion, where that succeeds.
 
 og-pointcloud poses photographs -o desk
 """

@@ -45,7 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
         new = next((check.repair.split() for check in checks if check.verdict == "doubt" and check.repair), [])
         if not new:
             print_checks([check.as_dict() for check in checks], capture)
-            print("no repair is known that would help")
+            doubts = any(check.verdict == "doubt" for check in checks)
+            print("no repair is known that would help" if doubts else "nothing was found that needs a repair")
             return
     # Read with the repairs before they are written: those that make no sense of the capture are refused here.
     checks = check_capture(read_capture(capture, repairs=[*stated, *new]))

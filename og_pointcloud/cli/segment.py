@@ -55,6 +55,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         return
     words = common.as_given(arguments, "--labels", "--text-features")
+    if not (result.labels >= 0).any():
+        return  # the warning says what helps; there is nothing to keep or to look at
     if arguments.output is None:
         words += [*common.as_given(arguments, "--points", "--pose"), "-o", common.labels_file(arguments.bundle)]
         common.print_next("segment", arguments.bundle, *words, hint="to keep the labels: ")

@@ -65,7 +65,8 @@ class FrameChange:
 
 
 class Mapper:
-    """See the module.
+    """A map that grows: `integrate` takes a frame, `objects` lists what is known, `snapshot` is a scene that can be
+    asked, `save` writes it.
 
     start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: known geometry,
     so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes; rows with

@@ -1,7 +1,7 @@
-"""Scene editing (A.2.1): objects taken out, kept alone, recoloured, or put into a cloud or 3DGS file.
+"""Scene editing (A.2.1): objects taken out, kept alone, recolored, or put into a cloud or 3DGS file.
 
     og.edit.remove(scene, "red mug", "without.ply", cloud="kitchen.ply")
-    og.edit.recolour(scene, "chair", "blue.ply", (40, 70, 220), cloud="kitchen.ply")
+    og.edit.recolor(scene, "chair", "blue.ply", (40, 70, 220), cloud="kitchen.ply")
     og.edit.extract(scene, og.pick(scene, (1.2, 0.4, 0.8)), "mug.ply", cloud="kitchen.ply")
     og.edit.insert("kitchen.ply", "mug.ply", "two_mugs.ply", pose)
 
@@ -38,7 +38,7 @@ from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.formats.tables import naming, positions
 from og_pointcloud.scene import DoubleArray, IntArray
-from og_pointcloud.show.splat_columns import appended, placed, recoloured
+from og_pointcloud.show.splat_columns import appended, placed, recolored
 from og_pointcloud.text.words import TextFeatures
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class EditOptions(TypedDict, total=False):
 @dataclass(frozen=True)
 class Edit:
     """What an edit wrote. path: the file. points: how many it has. changed: how many were removed, extracted,
-    recoloured or inserted. instances: ids of the scene's instances concerned. notes: what could not be kept."""
+    recolored or inserted. instances: ids of the scene's instances concerned. notes: what could not be kept."""
 
     path: Path
     points: int
@@ -99,7 +99,7 @@ def extract(scene: SceneLike, what: What, output: StrPath, **options: Unpack[Edi
     return subject.write(output, subject.rows[subject.chosen], "extracted")
 
 
-def recolour(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **options: Unpack[EditOptions]) -> Edit:
+def recolor(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud with some instances in another color.
 
     color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the color, and Gaussians also
@@ -109,7 +109,7 @@ def recolour(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **
     if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
     subject = _subject(scene, what, output, **options)
-    return subject.write(output, recoloured(subject.rows, subject.chosen, rgb / 255), "recoloured")
+    return subject.write(output, recolored(subject.rows, subject.chosen, rgb / 255), "recolored")
 
 
 def insert(

@@ -39,7 +39,7 @@ body {{ font: 15px/1.4 system-ui, sans-serif; margin: 2em; color: #222; backgrou
 main {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); gap: 1.2em }}
 figure {{ margin: 0 }} img, .none {{ width: 100%; aspect-ratio: 1; border-radius: 6px; background: #fafafa }}
 .none {{ display: grid; place-items: center; color: #999 }} figcaption {{ font-size: 13px }}
-b {{ font-size: 15px }} .score {{ float: right }}
+b {{ font-size: 15px }} .score {{ float: right }} .misfit {{ opacity: 0.4 }}
 </style></head><body><h1>{title}</h1><p>{notes}</p><main>
 {cards}
 </main></body></html>
@@ -50,10 +50,14 @@ def write_findings(path: StrPath, collection: Collection, findings: Findings, ti
     """Write the page, whole or not at all. title: what was asked."""
     text = PAGE.format(
         title=html.escape(title),
-        notes="<br>".join(map(html.escape, findings.not_asked)),
+        notes="<br>".join(map(html.escape, [_fitting(findings), *findings.not_asked])),
         cards="\n".join(_card(rank, finding, collection) for rank, finding in enumerate(findings, 1)),
     )
     write_file(path, text.encode())
+
+
+def _fitting(findings: Findings) -> str:
+    return f"{sum(finding.fits for finding in findings)} of these {len(findings)} fit; pale ones do not"
 
 
 def _card(rank: int, finding: Finding, collection: Collection) -> str:
@@ -64,8 +68,9 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
     except (OgPointcloudError, OSError):  # moved, or written anew: what was found then is still true of it then
         shown = '<div class="none">file not found</div>'
     center, size = ", ".join(map(coordinate, finding.center)), ", ".join(f"{value:.3g}" for value in finding.size)
+    kind = "" if finding.fits else " class=misfit"
     return (
-        f'<figure>{shown}<figcaption><span class="score">{finding.score:.3f}</span><b>{rank}. '
+        f'<figure{kind}>{shown}<figcaption><span class="score">{finding.score:.3f}</span><b>{rank}. '
         f"{html.escape(finding.word)}</b><br>{html.escape(finding.scene)}, instance {finding.instance}<br>"
         f"at {center}<br>size {size}</figcaption></figure>"
     )

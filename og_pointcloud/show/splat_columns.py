@@ -1,4 +1,4 @@
-"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others.
+"""Columns of a cloud or 3DGS file that an edit changes: recolored, moved into another frame, put behind others.
 
 A splat's color seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
 Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
@@ -35,7 +35,7 @@ MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
 
 
-def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows:
+def recolored(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows:
     """The rows with those chosen in another color, as harmonics, as red green blue, or both; a plain cloud without
     colors becomes gray. color: (3,), 0 to 1; the mean of the object becomes that color, its light and dark stay."""
     columns, rgb = _columns(rows), colors(rows)
