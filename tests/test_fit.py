@@ -194,6 +194,7 @@ def test_points_given_twice_get_the_labels_they_had(known: Known, labelled: Labe
     colors = None if points.rgb is None else points.rgb[again]
     cloud = fit(replace(known.scene, points=replace(points, xyz=points.xyz[again], rgb=colors)), progress=False)
     np.testing.assert_array_equal(cloud.instance_ids, labelled.instance_ids[again])
+    np.testing.assert_array_equal(cloud.instances.points, 2 * labelled.instances.points)
     (entry,) = cloud.provenance["left_out"]
     assert (entry["key"], entry["what"]) == ("coincident points", f"{count} points")
     assert "exactly where another lies" in entry["why"]
