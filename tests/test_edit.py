@@ -254,6 +254,22 @@ def test_recoloured_plain_cloud(scene, tmp_path):
     np.testing.assert_allclose(new, np.minimum(shading[:, None] * [250, 0, 120], 255), atol=0.51)
 
 
+@pytest.mark.parametrize("shade", [0, 5])
+def test_a_dark_object_takes_the_new_colour_too(scene, splats, tmp_path, shade):
+    mine, color = scene.instance_ids == 3, [200, 100, 20]
+    dark = dict.fromkeys(("red", "green", "blue"), np.full(len(scene.xyz), shade, np.uint8))
+    plain = plain_file(tmp_path / "dark.ply", scene.xyz, **dark)
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=plain)
+    np.testing.assert_array_equal(stacked(vertices(done.path), dark)[mine], np.tile(color, (mine.sum(), 1)))
+    rows = vertices(splats)
+    for name in BASE:
+        rows[name] = (shade / 255 - 0.5) / SH_CONSTANT
+    write_ply(tmp_path / "splats_dark.ply", {"vertex": rows})
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=tmp_path / "splats_dark.ply")
+    now = 0.5 + SH_CONSTANT * stacked(vertices(done.path), BASE)
+    np.testing.assert_allclose(255 * now[mine], np.tile(color, (mine.sum(), 1)), atol=1e-3)
+
+
 def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_path):
     mine, n = scene.instance_ids == 3, len(scene.xyz)
     half = dict.fromkeys(("r", "g", "b"), np.linspace(0, 1, n).astype(np.float32))
