@@ -355,6 +355,19 @@ def test_harmonics_that_the_cloud_lacks_are_left_out_and_told(tmp_path):
     assert "are 0" in back.notes[0]
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_inserted_points_keep_their_places_in_map_coordinates(tmp_path, kind):
+    """float32 has steps of half a meter at 4e6, whole numbers of one."""
+    random, away = np.random.default_rng(0), np.array([5e5, 4e6, 20])
+    base = plain_file(tmp_path / "base.ply", (50 * random.normal(size=(30, 3)) + away).astype(kind))
+    other = plain_file(tmp_path / "other.ply", random.random((20, 3)).astype(np.float32))
+    pose = np.eye(4)
+    pose[:3, 3] = away
+    rows = vertices(og.edit.insert(base, other, tmp_path / "out.ply", pose).path)
+    np.testing.assert_array_equal(stacked(rows[:30], "xyz"), stacked(vertices(base), "xyz"))
+    np.testing.assert_allclose(stacked(rows[30:], "xyz"), stacked(vertices(other), "xyz") + away, rtol=0, atol=1e-4)
+
+
 def test_properties_that_only_one_has_are_told(tmp_path):
     random = np.random.default_rng(0)
     base = plain_file(tmp_path / "base.ply", random.random((4, 3)), curvature=np.ones(4, np.float32))

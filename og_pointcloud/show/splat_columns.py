@@ -19,7 +19,7 @@ from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.poses import quaternion_of
-from og_pointcloud.formats.tables import colors, positions, stack_columns
+from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
 from og_pointcloud.scene import DoubleArray
 
 Rows: TypeAlias = NDArray[np.void]
@@ -78,8 +78,11 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The rows of both, with the columns of the first; and notes of what was lost. Where the two hold colors in
-    different columns or types, both become bytes."""
+    different columns or types, both become bytes. Positions become float64 where the first's type would move points
+    (`storable_positions`)."""
     first, second = _columns(base), _columns(added)
+    places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
+    first |= {axis: first[axis].astype(np.promote_types(first[axis].dtype, places)) for axis in "xyz"}
     zeros, notes = np.zeros(len(added)), []
     types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
     if types[0] != types[1] and (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
