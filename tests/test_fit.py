@@ -230,6 +230,21 @@ def test_gaussians_are_taken_as_they_are(known: Known) -> None:
     assert "gaussian_scale" not in cloud.provenance["notes"]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("tile_points", [None, 1 << 12])
+def test_one_gaussian_that_diverged_does_no_harm(known: Known, tile_points: int | None) -> None:
+    """Files may hold scales up to float32's largest."""
+    points = known.scene.points
+    n = len(points)
+    scale = np.full((n, 3), 0.4 * SPACING, np.float32)
+    scale[5] = 3e38
+    gaussians = replace(
+        points, scale=scale, rotation=np.tile(np.float32([1, 0, 0, 0]), (n, 1)), opacity=np.full(n, 0.1, np.float32)
+    )
+    cloud = fit(replace(known.scene, points=gaussians), FitSettings(tile_points=tile_points), progress=False)
+    assert share_right(cloud, known.truth) > 0.8
+
+
 @pytest.mark.slow
 def test_photographs_are_not_needed(known: Known) -> None:
     scene = boxes_on_a_table(photographs=True).scene

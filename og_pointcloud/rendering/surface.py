@@ -134,7 +134,8 @@ def surface_thickness(
         return sight_thickness(spacing, typical_spacing, settings)
     # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
     # so twice as thick, and a splat reaches three standard deviations beyond its center.
-    thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
+    with np.errstate(over="ignore"):  # a splat near float32's largest is infinitely thick
+        thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
 
 
