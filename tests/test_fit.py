@@ -200,6 +200,22 @@ def test_points_given_twice_get_the_labels_they_had(known: Known, labelled: Labe
     assert "exactly where another lies" in entry["why"]
 
 
+def test_order_does_not_matter_where_points_of_other_colors_coincide() -> None:
+    random, scene = np.random.default_rng(0), boxes_on_a_table(photographs=True).scene
+    points, count = scene.points, len(scene.points)
+    assert points.rgb is not None
+    again = np.append(np.arange(count), random.integers(0, count, count // 2))
+    rgb = points.rgb[again]
+    rgb[count:] = random.integers(0, 256, (len(again) - count, 3))
+    ordered, reverse = (
+        fit(replace(scene, points=replace(points, xyz=points.xyz[again[rows]], rgb=rgb[rows])), progress=False)
+        for rows in (np.arange(len(again)), np.arange(len(again))[::-1])
+    )
+    np.testing.assert_array_equal(reverse.instance_ids[::-1], ordered.instance_ids)
+    assert reverse.certainty is not None
+    np.testing.assert_array_equal(reverse.certainty[::-1], ordered.certainty)
+
+
 def test_views_given_twice_do_not_matter(known: Known, labelled: LabelledCloud) -> None:
     twice = (*known.scene.views, *[replace(view, name=f"{view.name} again") for view in known.scene.views])
     cloud = fit(replace(known.scene, views=twice), progress=False)

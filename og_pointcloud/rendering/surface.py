@@ -81,8 +81,8 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
     """The scene with one point per position, and for each of its points the row that stands for it; None if all differ.
 
-    Of two points at the same position one would hide the other, which would then seem unseen. Gaussians all stay: how
-    they overlap is part of how the scene looks.
+    Of two points at the same position one would hide the other, which would then seem unseen. Their mean color counts,
+    whichever of them comes first. Gaussians all stay: how they overlap is part of how the scene looks.
     """
     points = scene.points
     if points.are_gaussians:
@@ -91,7 +91,12 @@ def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray
     if len(first) == len(points):
         return scene, None
     journal.leave_out(LeftOut.COINCIDENT_POINTS, count=len(points) - len(first))
-    return replace(scene, points=points.take(first)), row_of_point
+    distinct = points.take(first)
+    if points.rgb is not None:
+        sums = [np.bincount(row_of_point, channel) for channel in points.rgb.T]  # of whole numbers: in any order exact
+        colors = np.rint(np.stack(sums, axis=1) / np.bincount(row_of_point)[:, None])
+        distinct = replace(distinct, rgb=colors.astype(np.uint8))
+    return replace(scene, points=distinct), row_of_point
 
 
 def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> tuple[Scene, NDArray[np.int64]]:
