@@ -226,8 +226,7 @@ MUTATIONS = (
     ),
     Mutation(
         "equal labels compete", "ask/choosing.py",
-        "rounded = np.round(unit_rows(texts), 5) + 0.0", "rounded = np.arange(len(texts), dtype=np.float32)[:, None]",
-        CHOOSING,
+        "hypothesis, first = _distinct(texts)", "hypothesis = first = np.arange(len(texts))", CHOOSING,
     ),
     Mutation(
         "what lies behind a rim shows through a hole", "fitting/holes.py",

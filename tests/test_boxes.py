@@ -79,6 +79,18 @@ def test_a_box_holds_what_lies_before_its_faces_and_no_more(margin):
         assert not box.contains(face + 1e-9 * np.outer([-1, 1], axis), margin).any()
 
 
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+@pytest.mark.parametrize("thickness", [0.0, 1.0])
+def test_a_box_holds_the_points_it_was_made_from(offset, thickness):
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        xyz = offset + random.normal(size=(50, 3)) * [2, 1, thickness] @ turn
+        for box in (axis_aligned_box(xyz), oriented_box(xyz), oriented_box(xyz, up=turn[0])):
+            assert box.contains(xyz).all()
+            assert box.contains(box.corners).all()
+
+
 @pytest.mark.parametrize(("count", "seed"), RANDOM_SHAPES)
 def test_volume_is_near_that_of_a_slow_search(count, seed):
     """Within a tenth, not exact: a few scattered points have no faces that a box could lie flush with."""

@@ -128,6 +128,15 @@ def test_a_duplicate_shares_the_probability_without_halving_it():
     np.testing.assert_allclose(twice.unknown, once.unknown, atol=1e-6)
 
 
+def test_duplicates_of_any_length_are_one_hypothesis():
+    made = Made()
+    texts = encoder_like_clip(200, seed=5)
+    lengths = np.random.default_rng(1).uniform(0.1, 10, (len(texts), 1)).astype(np.float32)
+    once, twice = made.chooser.choose(texts), made.chooser.choose(np.concatenate([texts, lengths * texts]))
+    np.testing.assert_allclose(twice.table, np.tile(once.table, 2), rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(twice.table[:, :200].sum(axis=1) + twice.unknown, 1, atol=1e-5)
+
+
 def test_an_irrelevant_label_barely_moves_the_others():
     made = Made()
     few, more = made.chooser.choose(made.texts[:4]), made.chooser.choose(made.texts[[0, 1, 2, 3, 40]])

@@ -254,6 +254,22 @@ def test_recolored_plain_cloud(scene, tmp_path):
     np.testing.assert_allclose(new, np.minimum(shading[:, None] * [250, 0, 120], 255), atol=0.51)
 
 
+@pytest.mark.parametrize("shade", [0, 5])
+def test_a_dark_object_takes_the_new_colour_too(scene, splats, tmp_path, shade):
+    mine, color = scene.instance_ids == 3, [200, 100, 20]
+    dark = dict.fromkeys(("red", "green", "blue"), np.full(len(scene.xyz), shade, np.uint8))
+    plain = plain_file(tmp_path / "dark.ply", scene.xyz, **dark)
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=plain)
+    np.testing.assert_array_equal(stacked(vertices(done.path), dark)[mine], np.tile(color, (mine.sum(), 1)))
+    rows = vertices(splats)
+    for name in BASE:
+        rows[name] = (shade / 255 - 0.5) / SH_CONSTANT
+    write_ply(tmp_path / "splats_dark.ply", {"vertex": rows})
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=tmp_path / "splats_dark.ply")
+    now = 0.5 + SH_CONSTANT * stacked(vertices(done.path), BASE)
+    np.testing.assert_allclose(255 * now[mine], np.tile(color, (mine.sum(), 1)), atol=1e-3)
+
+
 def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_path):
     mine, n = scene.instance_ids == 3, len(scene.xyz)
     half = dict.fromkeys(("r", "g", "b"), np.linspace(0, 1, n).astype(np.float32))
@@ -337,6 +353,19 @@ def test_harmonics_that_the_cloud_lacks_are_left_out_and_told(tmp_path):
     back = og.edit.insert(*files[::-1], tmp_path / "back.ply")
     assert not stacked(vertices(back.path)[9:], [f"f_rest_{k}" for k in range(45)]).any()
     assert "are 0" in back.notes[0]
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_inserted_points_keep_their_places_in_map_coordinates(tmp_path, kind):
+    """float32 has steps of half a meter at 4e6, whole numbers of one."""
+    random, away = np.random.default_rng(0), np.array([5e5, 4e6, 20])
+    base = plain_file(tmp_path / "base.ply", (50 * random.normal(size=(30, 3)) + away).astype(kind))
+    other = plain_file(tmp_path / "other.ply", random.random((20, 3)).astype(np.float32))
+    pose = np.eye(4)
+    pose[:3, 3] = away
+    rows = vertices(og.edit.insert(base, other, tmp_path / "out.ply", pose).path)
+    np.testing.assert_array_equal(stacked(rows[:30], "xyz"), stacked(vertices(base), "xyz"))
+    np.testing.assert_allclose(stacked(rows[30:], "xyz"), stacked(vertices(other), "xyz") + away, rtol=0, atol=1e-4)
 
 
 def test_properties_that_only_one_has_are_told(tmp_path):

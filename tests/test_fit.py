@@ -194,9 +194,26 @@ def test_points_given_twice_get_the_labels_they_had(known: Known, labelled: Labe
     colors = None if points.rgb is None else points.rgb[again]
     cloud = fit(replace(known.scene, points=replace(points, xyz=points.xyz[again], rgb=colors)), progress=False)
     np.testing.assert_array_equal(cloud.instance_ids, labelled.instance_ids[again])
+    np.testing.assert_array_equal(cloud.instances.points, 2 * labelled.instances.points)
     (entry,) = cloud.provenance["left_out"]
     assert (entry["key"], entry["what"]) == ("coincident points", f"{count} points")
     assert "exactly where another lies" in entry["why"]
+
+
+def test_order_does_not_matter_where_points_of_other_colors_coincide() -> None:
+    random, scene = np.random.default_rng(0), boxes_on_a_table(photographs=True).scene
+    points, count = scene.points, len(scene.points)
+    assert points.rgb is not None
+    again = np.append(np.arange(count), random.integers(0, count, count // 2))
+    rgb = points.rgb[again]
+    rgb[count:] = random.integers(0, 256, (len(again) - count, 3))
+    ordered, reverse = (
+        fit(replace(scene, points=replace(points, xyz=points.xyz[again[rows]], rgb=rgb[rows])), progress=False)
+        for rows in (np.arange(len(again)), np.arange(len(again))[::-1])
+    )
+    np.testing.assert_array_equal(reverse.instance_ids[::-1], ordered.instance_ids)
+    assert reverse.certainty is not None
+    np.testing.assert_array_equal(reverse.certainty[::-1], ordered.certainty)
 
 
 def test_views_given_twice_do_not_matter(known: Known, labelled: LabelledCloud) -> None:
@@ -228,6 +245,21 @@ def test_shapes_of_gaussians_do_not_matter(known: Known, labelled: LabelledCloud
     cloud = fit(replace(known.scene, points=gaussians), progress=False)
     np.testing.assert_array_equal(cloud.instance_ids, labelled.instance_ids)
     assert "scale, rotation and opacity of the Gaussians" in {entry["what"] for entry in cloud.provenance["left_out"]}
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("tile_points", [None, 1 << 12])
+def test_one_gaussian_that_diverged_does_no_harm(known: Known, tile_points: int | None) -> None:
+    """Files may hold scales up to float32's largest."""
+    points = known.scene.points
+    n = len(points)
+    scale = np.full((n, 3), 0.4 * SPACING, np.float32)
+    scale[5] = 3e38
+    gaussians = replace(
+        points, scale=scale, rotation=np.tile(np.float32([1, 0, 0, 0]), (n, 1)), opacity=np.full(n, 0.1, np.float32)
+    )
+    cloud = fit(replace(known.scene, points=gaussians), FitSettings(tile_points=tile_points), progress=False)
+    assert share_right(cloud, known.truth) > 0.8
 
 
 @pytest.mark.slow

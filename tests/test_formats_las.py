@@ -83,6 +83,17 @@ def test_las_of_any_kind_counts_right(tmp_path, version, point_format, suffix):
         assert len(read_points(tmp_path / f"cloud{suffix}")) == points
 
 
+@pytest.mark.parametrize("size", [1e-9, 1e-4, 0.3, 1.0, 1e6])
+@pytest.mark.parametrize("offset", [0.0, -5e6])
+def test_places_are_kept_to_a_hundred_millionth_of_the_extent(tmp_path, size, offset):
+    pytest.importorskip("laspy")
+    xyz = offset + size * np.random.default_rng(0).random((50, 3))
+    write_las(tmp_path / "a.las", xyz, np.zeros((50, 3), np.uint8), attributes_of([0] * 50), ("a",))
+    extent = np.ptp(xyz, axis=0).max()
+    rounding = 4 * np.spacing(abs(offset) + size)  # of float64, which such coordinates have anyway
+    np.testing.assert_allclose(read_points(tmp_path / "a.las").xyz_world, xyz, rtol=0, atol=5e-8 * extent + rounding)
+
+
 def test_copc_is_read_like_any_laz(tmp_path):
     """Its chunks are of any size, and its octree lies in records that others skip."""
     laspy = pytest.importorskip("laspy")

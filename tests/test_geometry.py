@@ -112,6 +112,13 @@ def test_duplicates_have_the_spacing_of_the_scene() -> None:
     assert around.adjoining[100:].all()
 
 
+def test_points_given_twice_have_the_spacing_they_had(random: Generator) -> None:
+    xyz = random.normal(size=(300, 3)).astype(np.float32)
+    again = np.concatenate([np.arange(300), np.arange(300), np.arange(0, 300, 3)])
+    once, twice = neighbourhood(xyz, SETTINGS), neighbourhood(xyz[again], SETTINGS)
+    np.testing.assert_array_equal(twice.spacing, once.spacing[again])
+
+
 def test_only_duplicates() -> None:
     around = neighbourhood(np.ones((50, 3), np.float32), SETTINGS)
     np.testing.assert_array_equal(around.spacing, 1)

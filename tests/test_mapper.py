@@ -230,6 +230,15 @@ def test_rows_of_a_cloud_that_lie_nowhere_are_left_out():
         og.Mapper(cloud=cloud[1:2])
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_an_outlier_of_a_known_cloud_does_no_harm():
+    xyz = surface(THINGS)[0]
+    more = np.concatenate([xyz, [[1e30, 0, 0], [0, -3e38, 0]]])
+    one, other = (mapped(frames(THINGS)[:4], cloud=points)[0].snapshot().cloud for points in (xyz, more))
+    np.testing.assert_array_equal(other.instance_ids[: len(xyz)], one.instance_ids)
+    assert (other.instance_ids[len(xyz) :] < 0).all()
+
+
 def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
     with pytest.raises(OgPointcloudError, match="settings is a str; expected an"):
         og.Mapper(settings="grouping")

@@ -49,7 +49,7 @@ from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_json
+from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_file, write_json
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
@@ -632,6 +632,18 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     changes = og.Collection.index(tmp_path / "scans", tmp_path / "atlas", progress=False).changes
     assert changes.added == ("a",)
     assert [name for name, _ in changes.left_out] == ["b"]
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
+    """Nor is /dev/null, by whoever may."""
+    pipe, read = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    write_file(pipe, b"written")
+    assert pipe.is_fifo()
+    reader.join()
+    assert read == [b"written"]
 
 
 def test_a_log_of_others_is_left_as_it_is(tmp_path):

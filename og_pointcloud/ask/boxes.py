@@ -31,6 +31,8 @@ PRODUCTS_AT_ONCE = 1 << 20
 THIN = 1e-6
 """Thickness, as a share of the diagonal, added to every side while volumes are compared: of two flat boxes, 0 x 2 x 3
 is then smaller than 0 x 4 x 5."""
+ROUNDING = 16 * float(np.finfo(np.float64).eps)
+"""Share of a box's coordinates and size by which rounding may put the points that it was made from outside it."""
 GAIN = 1e-9
 """A turned box counts as better only when it is smaller by more than this share."""
 TURNS = 6
@@ -88,10 +90,11 @@ class Box:
         return quaternion_of(self.axes.T)
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """(n,) bool, whether each of (n, 3) points lies inside, or outside by no more than margin along every axis.
-        SceneError for another shape."""
+        """(n,) bool, whether each of (n, 3) points lies inside, or outside by no more than margin along every axis; up
+        to rounding, so that the points of a face are inside. SceneError for another shape."""
         from_center = _rows(points) - self.center
-        return (np.abs(from_center @ self.axes.T) <= self.size / 2 + margin).all(axis=1)
+        slack = ROUNDING * (np.abs(self.center).max() + self.size.max())
+        return (np.abs(from_center @ self.axes.T) <= self.size / 2 + (margin + slack)).all(axis=1)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: center, size, axes, rotation_wxyz, volume."""

@@ -41,6 +41,9 @@ from og_pointcloud.cloud import (
 from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 from og_pointcloud.settings import ChoosingSettings
 
+SAME = 1e-5
+"""Unit vectors no farther apart than this are of the same text: float32 rounds them by a hundredth of it."""
+
 
 class Reason(IntEnum):
     """Why a point or instance has no label.
@@ -328,9 +331,33 @@ def common_part(descriptors: FloatArray, bank_directions: FloatArray, sharpness:
 def _distinct(texts: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(T,) number of each text among the different ones, and (different,) where each comes first."""
     # Five digits: the same text is the same vector again, whatever length it was given at.
-    rounded = np.round(unit_rows(texts), 5) + 0.0  # -0 becomes 0
+    rows = unit_rows(texts)
+    rounded = np.round(rows, 5) + 0.0  # -0 becomes 0
     _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    return number.reshape(-1), first
+    same = _joined(rows[first])
+    kept, group = np.unique(same, return_inverse=True)
+    earliest = np.full(len(kept), len(rows))
+    np.minimum.at(earliest, group.reshape(-1), first)
+    return group.reshape(-1)[number.reshape(-1)], earliest
+
+
+def _joined(rows: NDArray[np.floating]) -> NDArray[np.intp]:
+    """(n,) for each of some unit rows (n, D) the number of one that is the same within SAME, its own where none is.
+
+    Rounding alone tells the same vector apart where a number lies halfway between two that it rounds to.
+    """
+    along = rows @ unit_rows(np.random.default_rng(0).normal(size=rows.shape[1])).astype(rows.dtype)
+    order, same = np.argsort(along), np.arange(len(rows))
+    # Rows that are the same lie as near along any direction; most have no other so near.
+    for step in range(1, len(rows)):
+        one, other = order[:-step], order[step:]
+        near = np.flatnonzero(along[other] - along[one] <= SAME)
+        if not len(near):
+            break
+        apart = np.linalg.norm(rows[one[near]] - rows[other[near]], axis=1)
+        for pair in near[apart <= SAME]:
+            same[same == same[other[pair]]] = same[one[pair]]
+    return same
 
 
 def _moments(scores: FloatArray) -> tuple[FloatArray, FloatArray]:

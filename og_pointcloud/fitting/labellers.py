@@ -62,7 +62,9 @@ class Labelling:
         if rows is None:
             return self
         certainty = None if self.certainty is None else self.certainty[rows]
-        return replace(self, instance_ids=self.instance_ids[rows], certainty=certainty)
+        ids = self.instance_ids[rows]
+        points = np.bincount(ids[ids >= 0], minlength=len(self.instances)).astype(np.int32)
+        return replace(self, instance_ids=ids, instances=replace(self.instances, points=points), certainty=certainty)
 
 
 Labeller = Callable[[MaskTable, Surface, FitSettings, Journal], Labelling]

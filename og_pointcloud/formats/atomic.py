@@ -34,10 +34,15 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
 
     Several processes may write one path at a time: each file is whole, and the last one stays. Missing folders above it
     are made; what killed runs have left of the same path is removed.
+    A device or a pipe, as /dev/null is, is written to and stays.
     durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one; False
     for files whose readers check them. OSError names the path also where writing fails (a full disk).
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as file:
+            yield file
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
     temporary = _temporary(path)

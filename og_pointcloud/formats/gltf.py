@@ -57,7 +57,7 @@ def write_gltf(
         feature id that says "none"; og_reason tells which none.
     names: what og_label counts.
     splats: Gaussians, row by row those of xyz_world; their shape and opacity are kept, their color is ``rgb``.
-    SceneError where there are no points or a coordinate is not finite.
+    SceneError where there are no points or a coordinate is not finite, also in float32.
     """
     path = Path(path)
     with naming(path):
@@ -67,7 +67,10 @@ def write_gltf(
         of_splats = {} if splats is None else _splat_columns(splats, rgb)
         # float32 around the median: world coordinates far from 0 would lose millimeters.
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
-        columns = {"POSITION": (xyz_world - origin).astype(np.float32), "COLOR_0": _linear_colors(rgb, splats)}
+        with np.errstate(over="ignore"):
+            local = (xyz_world - origin).astype(np.float32)
+        require_finite(local, f"glTF's float32 ends at 3.4e38, so {LABEL_FINITE}")
+        columns = {"POSITION": local, "COLOR_0": _linear_colors(rgb, splats)}
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
         for index, (name, texts) in enumerate(tables.items()):
             ids = attributes[name]  # below 0 becomes the null feature id, one beyond the last

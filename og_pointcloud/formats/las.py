@@ -267,8 +267,11 @@ def _grid(xyz_world: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
     bits."""
     if not len(xyz_world):
         return np.zeros(3), np.full(3, 1e-3)
-    offset = np.floor(xyz_world.min(axis=0))
-    extent = max(float((xyz_world - offset).max()), 1.0)
+    widest = float(np.ptp(xyz_world, axis=0).max())
+    # Whole units, or of a small cloud whole parts of one: else most counts would go to the way from the offset to it.
+    unit = 10.0 ** min(0.0, np.floor(np.log10(widest))) if widest > 0 else 1.0
+    offset = np.floor(xyz_world.min(axis=0) / unit) * unit
+    extent = max(float((xyz_world - offset).max()), unit)
     return offset, np.full(3, 10.0 ** np.floor(np.log10(extent / STEPS_PER_EXTENT)))
 
 

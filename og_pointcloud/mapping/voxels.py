@@ -102,9 +102,11 @@ class Packets:
         left, right = (fx, 0, cx + across), (-fx, 0, camera.width + across - cx)
         sides = np.array([(0, 0, 1), left, right, (0, fy, cy + down), (0, -fy, camera.height + down - cy)])
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        pose, reach = camera.world_to_camera, 2 * edge + np.linalg.norm(self.high - self.low, axis=1) / 2
+        # In float64: in float32 the square of an outlier at 1e20 is no number.
+        pose, low, high = camera.world_to_camera, self.low.astype(np.float64), self.high.astype(np.float64)
+        reach = 2 * edge + np.linalg.norm(high - low, axis=1) / 2
         # (packets, 5) how far inside of each plane the middle of the box lies, by the normals turned into the map.
-        inside = (self.low + self.high) / 2 @ (sides @ pose[:3, :3]).T + sides @ pose[:3, 3]
+        inside = (low + high) / 2 @ (sides @ pose[:3, :3]).T + sides @ pose[:3, 3]
         return self._rows((inside > -reach[:, None]).all(axis=1))
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:

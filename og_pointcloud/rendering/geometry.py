@@ -45,7 +45,7 @@ CURVE_REACH = 4
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """spacing: (n,) float32, mean distance to the three nearest points, tamed for duplicates and floaters.
+    """spacing: (n,) float32, mean distance to the three nearest other places, tamed for floaters.
     index: (n, k) int32, nearest points, nearest first, without the point itself. adjoining: (n, k) bool, those within
     the settings' reach (in spacings)."""
 
@@ -70,13 +70,29 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     """Spacing and neighbours of every point. xyz: (n, 3), any unit.
 
     A floater's own spacing says nothing about a surface: it is held to the median spacing of its neighbours.
-    Duplicates have spacing 0: they take the scene's median. One point alone has spacing 1.
+    Duplicates have the spacing of their place, as if it held one point. One point or place alone has spacing 1.
     """
+    index, distance = _nearest(xyz, settings.neighbours)
+    if distance[:, :1].all():
+        spacing, typical = _spacing(index, distance)
+    else:
+        first, place = distinct_places(xyz)
+        of_places, typical = _spacing(*_nearest(xyz[first], settings.neighbours))
+        spacing = of_places[place]
+    # Where points are denser than is typical, they adjoin as far as elsewhere.
+    adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
+    return Neighbourhood(spacing, index, adjoining)
+
+
+def _nearest(xyz: NDArray[np.float32], most: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """(n, k) each, the k nearest points of every point, nearest first and without itself, and how far away they are; k
+    is ``most``, or all others."""
     n = len(xyz)
-    k = min(settings.neighbours, n - 1)
+    k = min(most, n - 1)
+    index, distance = np.empty((n, k), np.int32), np.empty((n, k))
     if k == 0:
-        return Neighbourhood(np.ones(n, np.float32), np.zeros((n, 0), np.int32), np.zeros((n, 0), bool))
-    tree, index, distance = cKDTree(xyz), np.empty((n, k), np.int32), np.empty((n, k))
+        return index, distance
+    tree = cKDTree(xyz)
     for low in range(0, n, ROWS_AT_ONCE):
         rows = slice(low, min(n, low + ROWS_AT_ONCE))
         away, near = nearest_in(tree, xyz[rows], k + 1)
@@ -84,13 +100,16 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
         itself = near == np.arange(n)[rows, None]
         itself[~itself.any(axis=1), -1] = True  # more duplicates than k: leave out the last of them instead
         distance[rows], index[rows] = away[~itself].reshape(-1, k), near[~itself].reshape(-1, k)
+    return index, distance
+
+
+def _spacing(index: NDArray[np.int32], distance: NDArray[np.float64]) -> tuple[NDArray[np.float32], float]:
+    """(n,) spacing of points at different places from their nearest ones (n, k), and what is typical."""
+    if distance.shape[1] == 0:
+        return np.ones(len(distance), np.float32), 1.0
     spacing = distance[:, :3].mean(axis=1)
-    typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
-    spacing = np.where(spacing > 0, spacing, typical)
-    spacing = np.minimum(spacing, np.median(spacing[index[:, :TAMED_BY]], axis=1)).astype(np.float32)
-    # Where points are denser than is typical, they adjoin as far as elsewhere.
-    adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
-    return Neighbourhood(spacing, index, adjoining)
+    tamed = np.minimum(spacing, np.median(spacing[index[:, :TAMED_BY]], axis=1))
+    return tamed.astype(np.float32), float(np.median(spacing))
 
 
 def drawn_spacing(xyz: NDArray[np.float32], around: Neighbourhood) -> NDArray[np.float32]:

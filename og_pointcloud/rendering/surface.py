@@ -29,7 +29,8 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (in mode paper Gaussians all stay), in order of place. n below is the number of its points.
+    scene: with one point per position (in mode paper Gaussians all stay), in order of place. n below is the number of
+    its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in their order.
     neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
@@ -81,10 +82,10 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
 
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
     """The scene with one point per position, and for each of its points the row that stands for it; None if all differ.
-    Of two points at the same position one would hide the other, which would then seem unseen.
 
-    Gaussians are points at their centers: their shapes are made to look right together, not to say where a surface is.
-    Drawn as trained they let rays through where they are faint, and hide what lies beside them where they are large.
+    Of two points at the same position one would hide the other, which would then seem unseen. Their mean color counts,
+    whichever of them comes first. Gaussians are points at their centers: their shapes are made to look right together,
+    not to say where a surface is.
     """
     points = scene.points
     if points.are_gaussians:
@@ -95,7 +96,12 @@ def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray
     if len(first) == len(points):
         return scene, None
     journal.leave_out(LeftOut.COINCIDENT_POINTS, count=len(points) - len(first))
-    return replace(scene, points=points.take(first)), row_of_point
+    distinct = points.take(first)
+    if points.rgb is not None:
+        sums = [np.bincount(row_of_point, channel) for channel in points.rgb.T]  # of whole numbers: in any order exact
+        colors = np.rint(np.stack(sums, axis=1) / np.bincount(row_of_point)[:, None])
+        distinct = replace(distinct, rgb=colors.astype(np.uint8))
+    return replace(scene, points=distinct), row_of_point
 
 
 def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> tuple[Scene, NDArray[np.int64]]:
@@ -138,7 +144,8 @@ def surface_thickness(
         return sight_thickness(spacing, typical_spacing, settings)
     # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
     # so twice as thick, and a splat reaches three standard deviations beyond its center.
-    thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
+    with np.errstate(over="ignore"):  # a splat near float32's largest is infinitely thick
+        thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
 
 

@@ -121,7 +121,7 @@ def insert(
     pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
     Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
     harmonics, exactly, up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
-    points.
+    points, and positions become float64 where float32 would move points by more than 1e-6 of the extent.
     SceneError for a pose that shears or mirrors, and for clouds of different kinds or that cannot be read.
     """
     rotation, scale, translation = _similarity(pose)

@@ -19,7 +19,7 @@ from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.poses import quaternion_of
-from og_pointcloud.formats.tables import colors, positions, stack_columns
+from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
 from og_pointcloud.scene import DoubleArray
 
 Rows: TypeAlias = NDArray[np.void]
@@ -30,7 +30,7 @@ RGB = ("red", "green", "blue")
 COLORS = (*RGB, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
 """All names of color columns, which give way to RGB of type uchar."""
 DARK = 0.05
-"""Mean luminance below which an object's shading is too faint to be kept in a new color."""
+"""Mean luminance below which an object's shading is too faint to be kept in a new color at its full strength."""
 MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
 
@@ -43,14 +43,15 @@ def recolored(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows
     if is_splat:
         # Color is linear in the coefficients, so a linear map of colors acts on the coefficients too.
         base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR)[chosen]
-        mapping = _color_map(np.clip(base, 0, 1), color)
-        _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
+        mapping, added = _color_map(np.clip(base, 0, 1), color)
+        _set(columns, BASE_COLOR, (base @ mapping.T + added - 0.5) / SH_CONSTANT, chosen)
         _set(columns, _rest_names(rows), np.einsum("dc,nck->ndk", mapping, _rest(rows)[chosen]), chosen)
     elif rgb is None:
         rgb = np.full((len(rows), 3), 128, np.uint8)
     if rgb is not None:
         base = rgb[chosen] / 255
-        rgb[chosen] = np.rint(255 * np.clip(base @ _color_map(base, color).T, 0, 1)).astype(np.uint8)
+        mapping, added = _color_map(base, color)
+        rgb[chosen] = np.rint(255 * np.clip(base @ mapping.T + added, 0, 1)).astype(np.uint8)
         columns = _in_bytes(columns, rgb)
     return join_columns(columns)
 
@@ -77,8 +78,11 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The rows of both, with the columns of the first; and notes of what was lost. Where the two hold colors in
-    different columns or types, both become bytes."""
+    different columns or types, both become bytes. Positions become float64 where the first's type would move points
+    (`storable_positions`)."""
     first, second = _columns(base), _columns(added)
+    places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
+    first |= {axis: first[axis].astype(np.promote_types(first[axis].dtype, places)) for axis in "xyz"}
     zeros, notes = np.zeros(len(added)), []
     types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
     if types[0] != types[1] and (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
@@ -100,10 +104,11 @@ def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
     return columns | dict(zip(RGB, rgb.T, strict=True))
 
 
-def _color_map(base: DoubleArray, color: DoubleArray) -> DoubleArray:
-    """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color, so that their mean becomes
-    that color."""
-    return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK)
+def _color_map(base: DoubleArray, color: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
+    """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color; and (3,) what is added to them
+    where they are too dark for it, so that their mean becomes that color."""
+    mean = float((base @ LUMINANCE).mean())
+    return np.outer(color, LUMINANCE) / max(mean, DARK), color * max(0.0, 1 - mean / DARK)
 
 
 def _turned(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
