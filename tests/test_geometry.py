@@ -37,11 +37,6 @@ def grid(side: int, step: float = 1.0) -> NDArray[np.float32]:
     return np.stack([*np.meshgrid(line, line), np.zeros((side, side))], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-@pytest.fixture
-def random() -> Generator:
-    return np.random.default_rng(0)
-
-
 def test_spacing_of_a_lattice_is_its_step() -> None:
     around = neighbourhood(grid(10, 0.25), SETTINGS)
     assert around.spacing.dtype == np.float32

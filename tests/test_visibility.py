@@ -133,11 +133,6 @@ def hard_scene(request: pytest.FixtureRequest) -> tuple[Gaussians, Camera]:
     return HARD_SCENES[request.param](np.random.default_rng(list(HARD_SCENES).index(request.param)))
 
 
-@pytest.fixture
-def random() -> Generator:
-    return np.random.default_rng(0)
-
-
 def patches(view: Camera, count: int = MASKS, size: int = 5) -> NDArray[np.int32]:
     """Ids -1..count-1 in square patches."""
     random = np.random.default_rng(1)
