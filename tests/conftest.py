@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from labelled_clouds import room
 from scenes import TinyCapture, write_tiny_capture
@@ -27,3 +28,9 @@ def scene(bundle: Path) -> og.LabelledScene:
 def tiny_capture(tmp_path: Path) -> TinyCapture:
     """A plain-format capture of about 1,500 points and 6 views in ``tmp_path / "capture"``."""
     return write_tiny_capture(tmp_path / "capture")
+
+
+@pytest.fixture
+def random() -> np.random.Generator:
+    """The same numbers in every test."""
+    return np.random.default_rng(0)

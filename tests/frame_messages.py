@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from og_pointcloud_ros import write_fields
 from og_pointcloud_ros.messages import header
+from scipy.spatial.transform import Rotation
 
 SECOND = 1_000_000_000
 
@@ -17,10 +18,7 @@ def stamp_of(frame):
 def place_of(frame):
     """The camera in the map: translation (3,) and quaternion x y z w."""
     pose = np.linalg.inv(frame.camera.world_to_camera)
-    rotation = pose[:3, :3]
-    w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
-    x, y, z = (rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1])
-    return pose[:3, 3], np.append(np.array([x, y, z]) / (4 * w), w)
+    return pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat()
 
 
 def transform(make, parent, child, translation, rotation, stamp):

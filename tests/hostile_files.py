@@ -35,12 +35,12 @@ def zip_of(path: Path, members: dict[str, bytes], compression: int = zipfile.ZIP
 Change = Callable[[dict, dict[str, bytes]], Any]
 
 
-def changed(source: Path, path: Path, change: Change, *, declares: bool = True) -> Path:
-    """A .ogpc in which change(manifest, members) was made. declares: its manifest says how long all members are now."""
+def changed(source: Path, path: Path, change: Change) -> Path:
+    """A .ogpc in which change(manifest, members) was made; its manifest says how long all members are now."""
     members = members_of(source)
     manifest = json.loads(members.pop("manifest.json"))
     change(manifest, members)
-    for name, data in members.items() if declares and isinstance(manifest["members"], dict) else ():
+    for name, data in members.items() if isinstance(manifest["members"], dict) else ():
         manifest["members"].setdefault(name, {})["bytes"] = len(data)
     return zip_of(path, {"manifest.json": json.dumps(manifest).encode(), **members})
 

@@ -26,6 +26,7 @@ def quietly(*arguments: Any, **options: Any) -> og.Segmentation:
 
 
 def unit_rows(count: int, width: int = WIDTH, seed: int = 0) -> NDArray[np.float32]:
+    """Random rows of length 1."""
     rows = np.random.default_rng(seed).normal(size=(count, width))
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 

@@ -9,17 +9,10 @@ import benchmark_runtime
 import benchmark_visibility
 import numpy as np
 import pytest
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 
 from og_pointcloud.rendering.splatting import Cutoffs
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_bundle(room(1500), tmp_path_factory.mktemp("bundle") / "room.ogpc")
 
 
 def test_a_window_shows_what_the_image_shows_there() -> None:
@@ -48,16 +41,16 @@ def test_the_kernel_is_a_row_a_case(capsys: pytest.CaptureFixture[str]) -> None:
     assert lost[0] == 0 < lost[1] < lost[3] < 0.1
 
 
-def test_lookups_are_exact(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    benchmark_runtime.main([str(scene_file), "--points", "2000", "--rounds", "1", "--noise", "0.5"])
+def test_lookups_are_exact(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    benchmark_runtime.main([str(bundle), "--points", "2000", "--rounds", "1", "--noise", "0.5"])
     points, ours, tree, ratio, differ = capsys.readouterr().out.splitlines()[-1].replace(",", "").split()
     assert (points, float(differ)) == ("2000", 0)
     assert float(ratio) == pytest.approx(float(tree) / float(ours), rel=0.05)
 
 
-def test_footprint_of_a_fresh_process(scene_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+def test_footprint_of_a_fresh_process(bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     monkeypatch.setattr(benchmark_runtime.print_footprint, "__defaults__", (1,))
-    benchmark_runtime.main([str(scene_file), "--footprint"])
+    benchmark_runtime.main([str(bundle), "--footprint"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[3].split()[:4] == ["heavy", "libraries", "loaded", "none"]
     packages = [line.split()[0] for line in lines[5:]]

@@ -22,9 +22,8 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 @pytest.fixture(scope="module")
-def asked(tmp_path_factory):
+def asked(scene):
     """A scene, points that carriers of float32 and of whole tenths of millimetres hold exactly, and their labels."""
-    scene = og.load(write_bundle(room(), tmp_path_factory.mktemp("scene") / "room.ogpc"))
     random = np.random.default_rng(1)
     points = scene.xyz + random.normal(size=scene.xyz.shape) * 0.3 * scene.cloud.spacing
     points = (np.round(points * 8192) / 8192).astype(np.float32).astype(np.float64)

@@ -85,13 +85,9 @@ def dataset(request, tmp_path):
     return folder, names, size, lens
 
 
-def add_masks(folder, names, size):
-    write_masks(folder, names, size)
-
-
 def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
     folder, names, size, _ = dataset
-    add_masks(folder, names, size)
+    write_masks(folder, names, size)
     scene = read_capture(folder)
     assert [view.name for view in scene.views] == names
     fused = fuse_capture(folder)
@@ -127,7 +123,7 @@ def test_frames_without_a_pose_are_left_out_and_counted_once(tmp_path):
     names, size = write_scannet(folder)
     (folder / "pose/5.txt").write_text("\n".join(["-inf -inf -inf -inf"] * 4))
     (folder / "pose/15.txt").write_text("\n".join(["nan 0 0 0"] * 4))
-    add_masks(folder, names, size)
+    write_masks(folder, names, size)
     with pytest.warns(
         UserWarning, match=r"no finite pose for 2 of \d+ frames, which are left out, e.g. 'color/5.jpg'"
     ) as said:
@@ -140,7 +136,7 @@ def test_frames_of_a_recording_without_masks_are_left_out_but_fused(tmp_path):
     folder = tmp_path / "scene"
     folder.mkdir()
     names, size = write_seven_scenes(folder)
-    add_masks(folder, names[::2], size)
+    write_masks(folder, names[::2], size)
     with pytest.warns(UserWarning, match="3 of 6 images have no masks and are left out"):
         scene = read_capture(folder)
     assert [view.name for view in scene.views] == names[::2]
@@ -155,7 +151,7 @@ def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tm
     assert list(files)[COUNT] == "seq-02/frame-000000.color"
     assert files["seq-01/frame-000003.color"].camera.fx == DEPTH_FOCAL_PX * WIDTH / 640
     names = list(files)
-    add_masks(tmp_path, names, SIZE)
+    write_masks(tmp_path, names, SIZE)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # colour and depth are of one lens here, and said to be of two
         scene = read_capture(tmp_path)
@@ -167,7 +163,7 @@ def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tm
 def test_scannets_mesh_is_the_cloud_where_it_is_there(tmp_path):
     folder = tmp_path / "scene"
     names, size = write_scannet(folder)
-    add_masks(folder, names, size)
+    write_masks(folder, names, size)
     text = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     (folder / "scene_vh_clean_2.ply").write_text(text)
@@ -191,7 +187,7 @@ def nerfstudio(folder: Path, **keys):
 
 @pytest.mark.parametrize("keys", [{}, {"integer_depth_scale": 2e-4}])
 def test_nerfstudios_depth_files_are_fused(tmp_path, keys):
-    add_masks(tmp_path, nerfstudio(tmp_path, **keys), SIZE)
+    write_masks(tmp_path, nerfstudio(tmp_path, **keys), SIZE)
     scene = read_capture(tmp_path)
     assert distance_to_surface(scene.points.xyz_world).max() < fuse_capture(tmp_path).survey.voxel / 2
 
@@ -215,7 +211,7 @@ def test_a_depth_folder_beside_the_images_is_found(tmp_path):
     edit_poses(tmp_path, lambda content: [frame.pop("depth_file_path") for frame in content["frames"]])
     for index in range(COUNT):
         np.save(tmp_path / f"{index}.npy", look(room_poses(COUNT)[index], intrinsics=LENS)[0])
-    add_masks(tmp_path, names, SIZE)
+    write_masks(tmp_path, names, SIZE)
     with pytest.raises(SceneError, match=r"no geometry; .*depth images in depth/"):
         read_capture(tmp_path)
     (tmp_path / "depth").mkdir()
@@ -266,7 +262,7 @@ def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):
     names = nerfstudio(tmp_path)
     assert f"next: og-pointcloud masks {tmp_path}\n" in output_of(capsys, "fuse", tmp_path)
     (tmp_path / "points.ply").unlink()
-    add_masks(tmp_path, names, SIZE)
+    write_masks(tmp_path, names, SIZE)
     said = output_of(capsys, "fuse", tmp_path)
     assert "6 depth images" in said
     assert f"next: og-pointcloud fit {tmp_path} -o scene.ogpc\n" in said

@@ -13,7 +13,6 @@ from reference_splatting import pixel_weights
 from scenes import TinyCapture
 from scipy.sparse import csr_array, random_array, vstack
 
-from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.learned import instance_features as features
 from og_pointcloud.fitting.learned.instance_features import (
@@ -249,10 +248,3 @@ def test_too_few_steps_are_admitted(tiny: Rendered) -> None:
     learned = learn_features(tiny.table, FeatureSettings(max_steps=3))
     assert learned.steps == 3
     assert not learned.converged
-
-
-def test_masks_that_show_nothing_are_refused() -> None:
-    scene = random_views()
-    empty = replace(scene.table, weights=csr_array(scene.table.weights.shape, dtype=np.float32))
-    with pytest.raises(SceneError, match="none of the 11 masks shows a Gaussian"):
-        learn_features(empty)

@@ -25,22 +25,16 @@ from og_pointcloud.rendering.geometry import (
     strided,
 )
 from og_pointcloud.rendering.splatting import NEAR_SHARE
-from og_pointcloud.scene import Camera, View
+from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
 SETTINGS = GeometrySettings()
-NEAR = 0.1
 
 
 def grid(side: int, step: float = 1.0) -> NDArray[np.float32]:
     """A square lattice in the plane z = 0."""
     line = np.arange(side) * step
     return np.stack([*np.meshgrid(line, line), np.zeros((side, side))], axis=-1).reshape(-1, 3).astype(np.float32)
-
-
-@pytest.fixture
-def random() -> Generator:
-    return np.random.default_rng(0)
 
 
 def test_spacing_of_a_lattice_is_its_step() -> None:
@@ -166,22 +160,17 @@ def test_a_strided_camera_sees_the_strided_pixels(width: int, height: int, strid
     np.testing.assert_allclose(camera.fy * ray_y + camera.cy, first + stride * row + 0.5, atol=1e-9)
 
 
-def empty_view(camera: Camera, image: NDArray[np.uint8] | None = None) -> View:
-    masks = np.full((camera.height, camera.width), -1, np.int32)
-    return View("view", camera, masks, np.zeros((0, 4), np.float32), image)
-
-
-def frontal(distance: float, focal: float = 100.0) -> View:
+def frontal(distance: float) -> Camera:
     pose = np.eye(4)
     pose[2, 3] = distance
-    return empty_view(Camera(40, 30, focal, focal, 20, 15, pose))
+    return Camera(40, 30, 100.0, 100.0, 20, 15, pose)
 
 
 def test_near_plane_is_a_share_of_the_depth_of_what_is_in_front() -> None:
     xyz = np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, -50]], np.float32)
-    assert near_plane(xyz, [frontal(0.0).camera]) == pytest.approx(2 * NEAR_SHARE)
-    assert near_plane(xyz * 1000, [frontal(0.0).camera]) == pytest.approx(2000 * NEAR_SHARE)
-    assert near_plane(xyz, [frontal(-100.0).camera]) > 0
+    assert near_plane(xyz, [frontal(0.0)]) == pytest.approx(2 * NEAR_SHARE)
+    assert near_plane(xyz * 1000, [frontal(0.0)]) == pytest.approx(2000 * NEAR_SHARE)
+    assert near_plane(xyz, [frontal(-100.0)]) > 0
 
 
 def test_a_sample_of_points_does_not_depend_on_their_order() -> None:

@@ -24,11 +24,6 @@ def scene():
     return LabelledScene.from_cloud(replace(room(900), origin=FAR))
 
 
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return og.write_bundle(room(600), tmp_path_factory.mktemp("bundle") / "room.ogpc")
-
-
 @pytest.mark.parametrize("cloud", tough_clouds().values(), ids=tough_clouds())
 def test_every_cloud_has_a_table(cloud):
     table = og.instance_table(LabelledScene.from_cloud(cloud))

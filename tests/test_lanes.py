@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numba import njit
 from numpy.random import Generator
 
@@ -33,11 +32,6 @@ def power(a, out):
 @njit
 def reduce(a, limit):
     return total(load(a, 0)), any_of(load(a, 0) > spread(limit))
-
-
-@pytest.fixture
-def random() -> Generator:
-    return np.random.default_rng(0)
 
 
 def test_operations_are_those_of_numpy(random: Generator) -> None:

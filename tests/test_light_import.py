@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "trimesh", "laspy", "tqdm")
+HEAVY = ("torch", "open3d", "pyvista", "vtk", "cv2", "numba", "scipy", "onnx", "trimesh", "laspy", "tqdm")
 ASK = """
 import sys
 import numpy as np
@@ -41,10 +41,18 @@ def run(code, *arguments, **environment):
     return done.stdout
 
 
-def test_import_brings_nothing_heavy():
-    loaded = run("import og_pointcloud, sys; print(*sys.modules)").split()
+@pytest.mark.parametrize(
+    ("start", "heavy"),
+    [
+        ("import og_pointcloud", {*HEAVY, "numpy", "onnxruntime"}),
+        ("from og_pointcloud.cli import main; main(['--help'])", {*HEAVY, "onnxruntime"}),
+    ],
+)
+def test_a_start_brings_nothing_heavy(start, heavy):
+    code = f"import sys\ntry:\n    {start}\nexcept SystemExit:\n    pass\nprint('loaded', *sys.modules)"
+    loaded = run(code).split("loaded ")[1].split()
     assert "og_pointcloud" in loaded
-    assert not {*HEAVY, "numpy", "onnxruntime"} & set(loaded)
+    assert not heavy & set(loaded)
 
 
 def test_loading_and_asking_bring_nothing_heavy(bundle, tmp_path):

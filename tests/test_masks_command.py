@@ -405,7 +405,7 @@ def test_a_missing_image_and_a_missing_folder(tmp_path):
 def test_a_proposer_that_is_not_there_is_one_error(tmp_path):
     make_capture(tmp_path / "c", 2)
     settings = MaskSettings(proposer="onnx:none.onnx", encoder=None)
-    with pytest.raises(OgPointcloudError, match=r"proposer is 'onnx:none\.onnx'; expected opencv"):
+    with pytest.raises(OgPointcloudError, match=r"proposer is 'onnx:none\.onnx'; expected opencv, sam:FOLDER"):
         make_masks(tmp_path / "c", settings, progress=False)
 
 

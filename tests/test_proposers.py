@@ -13,7 +13,6 @@ from og_pointcloud.masking.automatic import AutomaticMasks, best_of_alike, grid,
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
-from og_pointcloud.masking.worker import open_proposer
 
 
 def painted(noise=4.0, size=(120, 160)):
@@ -285,8 +284,3 @@ def test_any_callable():
         as_proposals(masks, (5, 5))
     with pytest.raises(SceneError, match="expected Proposals, bool"):
         as_proposals(masks.astype(float), (120, 160))
-
-
-def test_unknown_proposers_name_the_known():
-    with pytest.raises(SceneError, match="expected opencv, sam:FOLDER"):
-        open_proposer("magic")

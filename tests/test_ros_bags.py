@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from commands import error_of, run
 from frame_messages import transform
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 
 pytest.importorskip("rosbags")
 
@@ -25,11 +23,6 @@ MAKE = rosbags_messages(STORE)
 WORDS = ["apple", "pear", "plum"]
 SECOND = 1_000_000_000
 CLOUDS = 4
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return og.load(write_bundle(room(1500), tmp_path_factory.mktemp("bags") / "room.ogpc"))
 
 
 def turned(parent, child, translation, stamp, yaw):

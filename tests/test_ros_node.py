@@ -12,8 +12,6 @@ import pytest
 pytest.importorskip("rosbags")
 
 import fake_ros
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 from og_pointcloud_ros import from_pointcloud2, read_fields, ros_messages, write_fields
 
 import og_pointcloud as og
@@ -22,11 +20,6 @@ PACKAGE = Path(__file__).resolve().parents[1] / "plugins" / "og_pointcloud_ros"
 STAMP = 5_000_000_000
 TURN_LEFT = (0, 0, np.sqrt(0.5), np.sqrt(0.5))
 WORDS = ["apple", "pear", "plum"]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return og.load(write_bundle(room(1500), tmp_path_factory.mktemp("node") / "room.ogpc"))
 
 
 @pytest.fixture

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 from og_pointcloud_ros import (
     UNLABELLED,
     from_pointcloud2,
@@ -175,11 +173,6 @@ def test_what_is_no_cloud():
 
 
 # Out ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return og.load(write_bundle(room(1500), tmp_path_factory.mktemp("ros") / "room.ogpc"))
 
 
 @pytest.fixture(scope="module")

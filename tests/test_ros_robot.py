@@ -105,7 +105,6 @@ def true_scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_the_example_leaves_a_picture_and_two_bags(true_scene, tmp_path):
     assert len(EXAMPLE.read_text().splitlines()) <= 60
     command = [sys.executable, str(EXAMPLE), "-o", str(tmp_path), "--scene", str(true_scene), "--frames", "8"]

@@ -618,10 +618,3 @@ def test_threads_share_a_segmenter(scene):
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(ask, frames * 5))
     assert all(same(result, alone[index % 8]) for index, result in enumerate(together))
-
-
-def test_ten_thousand_labels(scene):
-    vectors = unit_rows(10_000, seed=11)
-    result = og.segment(scene, {str(row): vector for row, vector in enumerate(vectors)})
-    labels, _ = labels_plainly(scene.cloud, result.instances[:200], vectors)
-    assert (result.labels[:200] == labels).all()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import error_of, output_of
-from labelled_clouds import WIDTH, WORDS, make_cloud, room, unit_rows
+from labelled_clouds import WIDTH, WORDS, make_cloud, unit_rows
 
 import og_pointcloud as og
 from og_pointcloud.ask.labelled_scene import LabelledScene
@@ -15,11 +15,6 @@ from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 
 AXES = np.eye(WIDTH, dtype=np.float32)
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return LabelledScene.from_cloud(room(900))
 
 
 def mugs_and_a_cup():

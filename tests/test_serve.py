@@ -38,6 +38,19 @@ def pages():
 
 
 @pytest.fixture
+def live():
+    return LiveScene(og.LabelledScene.from_cloud(room(300)))
+
+
+@pytest.fixture
+def page(pages, live):
+    """A page that shows ``live``."""
+    page = pages.serve({"room": live}, pages.ServeSettings(port=0))
+    yield page
+    page.stop()
+
+
+@pytest.fixture
 def window():
     """An empty page of a browser."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
@@ -58,10 +71,9 @@ def listens_at(port):
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens")
-def test_it_listens_on_this_machine_alone_unless_told_otherwise(pages, capsys):
-    scene = LiveScene(og.LabelledScene.from_cloud(room(300)))
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(pages, live, capsys):
     for host, address, is_open in (("127.0.0.1", "0100007F", False), ("0.0.0.0", "00000000", True)):
-        page = pages.serve({"room": scene}, pages.ServeSettings(host, 0))
+        page = pages.serve({"room": live}, pages.ServeSettings(host, 0))
         try:
             assert page.is_open == is_open
             assert page.url.startswith("http://127.0.0.1:")
@@ -71,64 +83,47 @@ def test_it_listens_on_this_machine_alone_unless_told_otherwise(pages, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_a_word_of_any_length_is_answered_in_a_few_lines(pages):
-    answer = LiveScene(og.LabelledScene.from_cloud(room(300))).ask("chair" * 2000)
+def test_a_word_of_any_length_is_answered_in_a_few_lines(pages, live):
+    answer = live.ask("chair" * 2000)
     assert len(answer.title) < 100
     assert all("is not among the" in line and len(line) < 1000 for line in answer.lines)
 
 
-def test_an_answer_is_sent_before_colors_are_made(pages, monkeypatch):
+def test_an_answer_is_sent_before_colors_are_made(pages, live, page, monkeypatch):
     """A browser shows what stands in the panel at once if no color is sent with it."""
-    live, sent = LiveScene(og.LabelledScene.from_cloud(room(300))), []
-    colors, page = live.colors, pages.serve({"room": live}, pages.ServeSettings(port=0))
-    try:
-        monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
-        monkeypatch.setattr(live, "colors", lambda: sent.append("colors") or colors())
-        page._word.value = "plum"
-        page._ask()
-    finally:
-        page.stop()
+    sent, colors = [], live.colors
+    monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
+    monkeypatch.setattr(live, "colors", lambda: sent.append("colors") or colors())
+    page._word.value = "plum"
+    page._ask()
     assert sent == [pages.answer_html(live.ask("plum")), "colors"]
 
 
-def test_beside_pictures_an_answer_waits_for_the_picture(pages, monkeypatch):
+def test_beside_pictures_an_answer_waits_for_the_picture(pages, live, page, monkeypatch):
     """Two frames of a slow browser would take twice the time."""
-    live, sent = LiveScene(og.LabelledScene.from_cloud(room(300))), []
-    page = pages.serve({"room": live}, pages.ServeSettings(port=0))
+    sent = []
     slow = SimpleNamespace(sends_pictures=True, paint=lambda colors: sent.append(page._answer.content), close=print)
-    try:
-        page._screens[0] = slow
-        before, page._word.value = page._answer.content, "plum"
-        monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
-        page._ask()
-    finally:
-        page.stop()
+    page._screens[0] = slow
+    before, page._word.value = page._answer.content, "plum"
+    monkeypatch.setattr(page._server, "flush", lambda: sent.append(page._answer.content))
+    page._ask()
     assert sent == [before, pages.answer_html(live.ask("plum"))]
 
 
-def test_a_browser_that_has_left_before_it_is_welcomed_gets_no_screen(pages):
+def test_a_browser_that_has_left_before_it_is_welcomed_gets_no_screen(page):
     """Both are told from threads, in any order; what is kept for it would never be let go."""
-    page = pages.serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, pages.ServeSettings(port=0))
-    try:
-        gone = SimpleNamespace(client_id=7)
-        page._left(gone)
-        page._came(gone)
-        assert page._screens == {}
-    finally:
-        page.stop()
+    gone = SimpleNamespace(client_id=7)
+    page._left(gone)
+    page._came(gone)
+    assert page._screens == {}
 
 
-def test_an_instance_chosen_of_the_scene_before_lights_nothing(pages):
+def test_an_instance_chosen_of_the_scene_before_lights_nothing(live, page):
     """One browser changes the scene while another chooses from its list."""
-    live = LiveScene(og.LabelledScene.from_cloud(room(300)))
-    page = pages.serve({"room": live}, pages.ServeSettings(port=0))
-    try:
-        for of_another_scene in ("1 · plum · 7", "1000 · plum · 7"):
-            page._list._impl.value = of_another_scene  # as viser sets what a browser sends
-            page._chosen()
-            assert live.lit is None
-    finally:
-        page.stop()
+    for of_another_scene in ("1 · plum · 7", "1000 · plum · 7"):
+        page._list._impl.value = of_another_scene  # as viser sets what a browser sends
+        page._chosen()
+        assert live.lit is None
 
 
 def test_a_notebook_shows_the_page_in_its_cell(pages):
@@ -154,8 +149,7 @@ def test_text_of_a_file_is_never_html(pages):
         assert name not in text
 
 
-def test_the_legend_has_the_colors_of_the_points(pages):
-    live = LiveScene(og.LabelledScene.from_cloud(room(300)))
+def test_the_legend_has_the_colors_of_the_points(pages, live):
     shown = pages.legend_html(live)
     for name, color, count in live.legend():
         red, green, blue = color
@@ -178,12 +172,12 @@ def test_bad_use_is_refused_in_one_line(pages, bundle, capsys, monkeypatch, opti
     assert said in error_of(capsys, "serve", bundle, *options)
 
 
-def test_an_empty_scene_is_refused(pages, tmp_path, capsys):
+def test_an_empty_scene_is_refused(pages, live, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
     assert "empty has no point to show" in error_of(capsys, "serve", empty)
 
     with pytest.raises(og.SceneError, match=r"up is \(0, 0, 0\); expected a direction"):
-        pages.serve({"room": LiveScene(og.LabelledScene.from_cloud(room(300)))}, pages.ServeSettings(up=(0, 0, 0)))
+        pages.serve({"room": live}, pages.ServeSettings(up=(0, 0, 0)))
 
 
 def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):

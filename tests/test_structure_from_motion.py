@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from pinhole import rays
+from pinhole import looking, rays
 from scenes import camera, distance_to_surface, look, write_image
 
 from og_pointcloud.cli import main
@@ -23,13 +23,7 @@ def arc():
     """Camera to world, OpenCV axes: around the crate in steps of 7 degrees, looking down at it."""
     for angle in np.radians(200 + 7 * np.arange(VIEWS)):
         eye = np.array([2 + 1.6 * np.cos(angle), 1.5 + 1.2 * np.sin(angle), 1.5])
-        forward = np.array([2.0, 1.5, 0.6]) - eye
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
-        yield pose
+        yield np.linalg.inv(looking(eye, [2.0, 1.5, 0.6] - eye))
 
 
 def photograph(pose):

@@ -49,6 +49,7 @@ from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.fitting.memory import memory_in_use
 from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_file, write_json
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
@@ -695,10 +696,6 @@ def test_names_of_files_are_printed_as_text(tmp_path, capsys):
 # Streams --------------------------------------------------------------------------------------------------------------
 
 
-def resident() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 def stream(bundle, sizes):
     ask = og.Segmenter(bundle, ["apple", "pear"])
     points = np.tile(room(500).xyz, (200, 1)).astype(np.float64)
@@ -710,9 +707,9 @@ def stream(bundle, sizes):
 @pytest.mark.filterwarnings("ignore:none of")
 def test_memory_is_flat_over_frames_of_many_sizes(bundle):
     stream(bundle, [1500] * 200)
-    before = resident()
+    before = memory_in_use()
     stream(bundle, range(1, 1501))
-    assert resident() - before < 5 << 20  # 7 kB a size is 10 MB
+    assert memory_in_use() - before < 5 << 20  # 7 kB a size is 10 MB
     tracemalloc.start()
     stream(bundle, range(100, 700))
     assert tracemalloc.get_traced_memory()[0] < 50_000

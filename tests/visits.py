@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,17 +38,15 @@ PARCEL = Thing((-0.3, -1.3, 0.0), (0.4, 0.4, 0.4), (220, 200, 40), 4)
 def moved(thing: Thing, by: tuple[float, float, float]) -> Thing:
     """The same thing elsewhere."""
     x, y, z = (a + b for a, b in zip(thing.low, by, strict=True))
-    return Thing((x, y, z), thing.size, thing.color, thing.feature)
+    return replace(thing, low=(x, y, z))
 
 
-def cameras(
-    count: int = 14, radius: float = 3.4, part: tuple[float, float] = (0, 1), size: tuple[int, int] = SIZE
-) -> list[Camera]:
+def cameras(count: int = 14, part: tuple[float, float] = (0, 1), size: tuple[int, int] = SIZE) -> list[Camera]:
     """On a circle, looking at the middle from above; of the circle, a part. size: of the images, of the same view."""
     focal_px = FOCAL_PX * size[0] / SIZE[0]
     made = []
     for turn in np.linspace(*part, count, endpoint=False) * 2 * np.pi:
-        center = np.array([radius * np.cos(turn), radius * np.sin(turn), 2.0])
+        center = np.array([3.4 * np.cos(turn), 3.4 * np.sin(turn), 2.0])
         made.append(Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2, looking(center, -center)))
     return made
 

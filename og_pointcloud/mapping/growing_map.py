@@ -26,7 +26,7 @@ from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
-from og_pointcloud.rendering.geometry import isotropic
+from og_pointcloud.rendering.geometry import depths, isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
 from og_pointcloud.rendering.surface import sight_thickness
@@ -234,7 +234,7 @@ def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySetti
     camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
     xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
-    depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    depth = depths(xyz, camera)
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
     open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, known.points.edge, geometry))
     return _seen(frame, rows, open_, np.stack([u, v], axis=1))

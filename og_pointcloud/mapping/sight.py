@@ -28,7 +28,7 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping.voxels import in_camera, turned
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighbourhood, depths, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
@@ -109,7 +109,7 @@ class DiscSurface:
 
     def seen_from(self, camera: Camera) -> MeasuredView:
         """What a view of the surface would measure, at the points' own resolution. camera: from their frame."""
-        depth = self.xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        depth = depths(self.xyz, camera)
         in_image = depth[camera.shows(camera.project(self.xyz)[0])]
         typical = float(np.median(in_image)) if len(in_image) else 1.0
         # Discs are drawn into a smaller image where the photograph has more pixels than the cloud has points for.

@@ -132,8 +132,8 @@ def drawn_spacing(xyz: NDArray[np.float32], around: Neighbourhood) -> NDArray[np
 def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
     """Depth of the near plane: a share of the median depth at which cameras see the cloud. Never 0."""
     sample = xyz[:: 1 + len(xyz) // 20_000].astype(np.float64)  # enough for a median; once for all cameras
-    depths = [_depths(sample, camera) for camera in cameras]
-    front = np.concatenate([depth[depth > 0] for depth in depths])
+    seen = [depths(sample, camera) for camera in cameras]
+    front = np.concatenate([depth[depth > 0] for depth in seen])
     return NEAR_SHARE * float(np.median(front)) if len(front) else 1e-6
 
 
@@ -240,6 +240,6 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
     return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
 
 
-def _depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
+def depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
     """(n,) depths along the camera's axis, scene units; negative behind it."""
     return xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

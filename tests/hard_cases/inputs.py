@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from labelled_clouds import unit_rows
 from numpy.typing import ArrayLike, NDArray
 from pinhole import looking
 from reference_splatting import pixel_weights, reference_pixel_weights
@@ -66,12 +67,6 @@ def solid(xyz: NDArray[np.float32]) -> Gaussians:
     """Round, nearly opaque Gaussians at these points."""
     rotation = np.tile(single([1, 0, 0, 0]), (len(xyz), 1))
     return Gaussians(xyz, np.full((len(xyz), 3), 0.06, np.float32), rotation, np.full(len(xyz), 0.9, np.float32))
-
-
-def unit_rows(count: int, width: int, seed: int = 0) -> NDArray[np.float32]:
-    """Random rows of length 1."""
-    rows = np.random.default_rng(seed).normal(size=(count, width))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def dense_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
