@@ -357,6 +357,19 @@ def test_threads_that_write_one_path_leave_one_whole_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link to a pipe"])
+def test_what_is_no_file_is_not_replaced(tmp_path, kind):
+    """Root could replace /dev/null, and nobody would have one any more."""
+    path, pipe = tmp_path / "path", tmp_path / "pipe"
+    os.mkfifo(pipe)
+    {"folder": path.mkdir, "pipe": lambda: pipe.rename(path), "link to a pipe": lambda: path.symlink_to(pipe)}[kind]()
+    before = path.lstat()
+    with pytest.raises(OgPointcloudError, match=r"'.*path' is a folder or a device; expected a file's name"):
+        write_json(path, {})
+    assert path.lstat() == before
+    assert not any(tmp_path.glob(".*"))
+
+
 def test_temporary_names_cannot_be_guessed_and_links_are_not_followed(tmp_path, monkeypatch):
     (tmp_path / "victim").write_text("kept")
     monkeypatch.setattr("secrets.token_hex", lambda _: "00000000")
