@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.scene import Camera, brief
+from og_pointcloud.scene import Camera, brief, require_finite
 
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
@@ -42,6 +42,12 @@ class FeatureSpace:
 
     name: str
     width: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise FeatureSpaceError(
+                f"the feature space is {self.name!r:.80}; expected the encoder's name, '{UNKNOWN_SPACE}' if not known"
+            )
 
     def accepts(self, other: FeatureSpace) -> bool:
         """Whether vectors of the other space can be compared with vectors of this one."""
@@ -99,13 +105,16 @@ class InstanceTable:
         for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
             if len(getattr(self, name)) == 0:
                 object.__setattr__(self, name, np.full(count, unknown))
-        for name in ("views", "masks", "agreement", "visible_area", "coarse", "part_of", "reliability"):
+        for name in ("points", "views", "masks", "agreement", "visible_area", "coarse", "part_of", "reliability"):
             if getattr(self, name).shape != (count,):
                 raise OgPointcloudError(f"instance {name} has shape {getattr(self, name).shape}; expected ({count},)")
         if self.descriptors.ndim != 2 or len(self.descriptors) != len(self.descriptor_instance):
             raise OgPointcloudError(
                 f"descriptors {self.descriptors.shape} and their instances {self.descriptor_instance.shape} differ"
             )
+        for each in fields(self):
+            kind = np.float32 if each.name in _FLOAT_COLUMNS else np.int32
+            object.__setattr__(self, each.name, _as_stored(getattr(self, each.name), kind, f"instance {each.name}"))
         owner = self.descriptor_instance  # ascending, so that each instance's descriptors are one slice
         if owner.size and (owner.min() < 0 or owner.max() >= count or (np.diff(owner) < 0).any()):
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
@@ -136,6 +145,17 @@ class InstanceTable:
             return np.full((len(self), len(vectors)), NO_EVIDENCE, vectors.dtype)
         cosines = self.descriptors.astype(vectors.dtype, copy=False) @ vectors.T
         return best_of_rows(cosines, self.descriptor_instance, len(self), NO_EVIDENCE)
+
+
+_FLOAT_COLUMNS = ("descriptors", "agreement", "visible_area", "reliability")
+
+
+def _as_stored(values: NDArray[Any], kind: type[np.number], what: str) -> NDArray[Any]:
+    """Numbers in the type that files hold; OgPointcloudError for what is no number of that kind."""
+    if values.dtype.kind not in ("fiu" if issubclass(kind, np.floating) else "iu"):
+        raise OgPointcloudError(f"{what} is {values.dtype}; expected {np.dtype(kind)}: convert it")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinity
+        return values.astype(kind, copy=False)
 
 
 def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> None:
@@ -175,8 +195,11 @@ class Vocabulary:
                 f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; "
                 "expected one row a name"
             )
+        object.__setattr__(self, "vectors", _as_stored(self.vectors, np.float32, "vocabulary vectors"))
         if not np.isfinite(self.vectors).all():
             raise OgPointcloudError("vocabulary vectors hold NaN or infinity")
+        if not all(isinstance(name, str) for name in self.names):
+            raise OgPointcloudError(f"the words are {[*self.names]!r:.80}; expected strings")
 
 
 @dataclass(frozen=True)
@@ -269,13 +292,19 @@ class LabelledCloud:
                 f"xyz {self.xyz.shape}, origin {self.origin.shape} and instance ids {self.instance_ids.shape} do not "
                 "fit; expected (n, 3), (3,) and (n,)"
             )
+        if self.xyz.dtype != np.float32:
+            raise OgPointcloudError(
+                f"xyz is {self.xyz.dtype}; expected float32 near zero: pass (xyz - origin).astype(np.float32)"
+            )
+        require_finite(self.xyz)
         if n and (self.instance_ids.min() < UNOBSERVED or self.instance_ids.max() >= len(self.instances)):
             raise OgPointcloudError(
                 f"instance ids span {self.instance_ids.min()}..{self.instance_ids.max()}; expected "
                 f"{UNOBSERVED}..{len(self.instances) - 1}"
             )
-        if self.rgb is not None and self.rgb.shape != (n, 3):
-            raise OgPointcloudError(f"rgb has shape {self.rgb.shape}; expected ({n}, 3)")
+        object.__setattr__(self, "instance_ids", _as_stored(self.instance_ids, np.int32, "instance ids"))
+        if self.rgb is not None and (self.rgb.shape != (n, 3) or self.rgb.dtype != np.uint8):
+            raise OgPointcloudError(f"rgb is {self.rgb.dtype} {self.rgb.shape}; expected uint8 ({n}, 3), 0 to 255")
         if self.certainty is not None and (self.certainty.shape != (n,) or self.certainty.dtype != np.uint8):
             raise OgPointcloudError(
                 f"certainty is {self.certainty.dtype} {self.certainty.shape}; expected uint8 {(n,)}"
@@ -286,8 +315,9 @@ class LabelledCloud:
                 raise OgPointcloudError(f"{name} is {value}; expected a positive length, {LENGTHS[0]} to {LENGTHS[1]}")
         if not (np.abs(self.origin) <= FARTHEST).all():
             raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {FARTHEST:g}")
+        space = self.space  # refuses a name that is none
         if self.word_bank is not None:
-            self.space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
+            space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
 
     def __len__(self) -> int:
         return len(self.xyz)

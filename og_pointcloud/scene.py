@@ -184,6 +184,8 @@ class View:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise SceneError(f"a view is called {self.name!r:.80}; expected text, as its image's file stem is")
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
@@ -215,8 +217,13 @@ class View:
 
     def mask_map(self) -> IntArray:
         """(H, W) int32: NOT_SEEN, -1 or a row of ``mask_features``. Read and checked anew on every call."""
-        ids = self.masks() if callable(self.masks) else self.masks
+        ids = np.asarray(self.masks() if callable(self.masks) else self.masks)
         expected = (self.camera.height, self.camera.width)
+        if ids.dtype.kind not in "iu" or ids.ndim != 2:
+            raise SceneError(
+                f"view '{self.name}': the mask map is {ids.dtype} {ids.shape}; expected whole numbers {expected}: rows "
+                "of mask_features, -1 outside of masks"
+            )
         if ids.shape != expected:
             raise SceneError(
                 f"view '{self.name}': the mask image is {ids.shape[1]}x{ids.shape[0]} pixels, its camera "
@@ -237,10 +244,11 @@ class View:
     def image_rgb(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) uint8 RGB at the camera's size, or None where the view has no image."""
         image = self.image() if callable(self.image) else self.image
-        if image is not None and image.shape != (self.camera.height, self.camera.width, 3):
+        expected = (self.camera.height, self.camera.width, 3)
+        if image is not None and (image.shape != expected or image.dtype != np.uint8):
             raise SceneError(
-                f"view '{self.name}': the image is {image.shape}, its camera "
-                f"({self.camera.height}, {self.camera.width}, 3): fix w and h of the pose file"
+                f"view '{self.name}': the image is {image.dtype} {image.shape}; expected uint8 {expected}, as its "
+                "camera: fix w and h of the pose file, or scale colors to 0..255"
             )
         return image
 
@@ -292,6 +300,11 @@ class Points:
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
+        if self.xyz.shape != (n, 3) or self.xyz.dtype != np.float32 or np.shape(self.origin) != (3,):
+            raise SceneError(
+                f"xyz is {self.xyz.dtype} {self.xyz.shape}, origin of shape {np.shape(self.origin)}; expected float32 "
+                f"{(n, 3)} near zero and (3,): Points.from_world(xyz) makes them of world coordinates"
+            )
         widths = {"rgb": 3, "scale": 3, "rotation": 4, "opacity": None}
         for name, width in widths.items():
             value = getattr(self, name)
@@ -393,6 +406,8 @@ class Scene:
     def __post_init__(self) -> None:
         if not self.views:
             raise SceneError("the scene has 0 views; expected at least one posed image with a mask")
+        if not len(self.points):
+            raise SceneError("the scene has 0 points; expected at least one: check the geometry")
         widths = {view.mask_features.shape[1]: view.name for view in self.views if view.mask_count}
         if len(widths) > 1:
             odd = next(f"{name}: {width}" for width, name in widths.items() if width != self.feature_width)

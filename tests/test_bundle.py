@@ -149,6 +149,60 @@ def test_ids_take_the_smallest_type(count, dtype):
     assert (writer._smallest_signed(ids) == ids).all()
 
 
+def _of_table(**columns):
+    return lambda cloud: replace(cloud, instances=replace(cloud.instances, **columns))
+
+
+def _with_words(names, vectors):
+    return lambda cloud: replace(cloud, vocabulary=Vocabulary(names, vectors))
+
+
+VECTORS = unit_rows(2).astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda cloud: replace(cloud, instance_ids=cloud.instance_ids.astype(np.int64)),
+        _of_table(points=np.arange(9), descriptors=unit_rows(9).astype(np.float16).astype(np.float64)),
+        _of_table(agreement=np.ones(9), views=np.ones(9, np.uint8), descriptor_instance=np.arange(9)),
+        _with_words(("mug", "cup"), VECTORS),
+        _with_words(["mug", "cup"], VECTORS.astype(np.float16)),
+    ],
+)
+def test_clouds_made_of_numpys_usual_types_are_written_as_files_that_open(tmp_path, change):
+    cloud = change(room(300))
+    scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
+    assert og.segment(scene).labels.tolist() == og.segment(cloud).labels.tolist()
+    assert scene.cloud.instances.points.tolist() == cloud.instances.points.tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda cloud: replace(cloud, xyz=cloud.xyz.astype(float)), "xyz is float64; expected float32 near zero"),
+        (lambda cloud: replace(cloud, xyz=cloud.xyz * np.float32("nan")), "300 of 300 points hold NaN"),
+        (lambda cloud: replace(cloud, instance_ids=cloud.instance_ids * np.nan), "instance ids is float64; expected i"),
+        (lambda cloud: replace(cloud, rgb=cloud.rgb / 255), r"rgb is float64 \(300, 3\); expected uint8 \(300, 3\)"),
+        (lambda cloud: replace(cloud, feature_space=None), "the feature space is None; expected the encoder's name"),
+        (_of_table(views=np.ones(9)), "instance views is float64; expected int32"),
+        (_of_table(points=np.ones((9, 1), int)), r"instance points has shape \(9, 1\); expected \(9,\)"),
+        (_with_words(("mug", "mug"), VECTORS), "the name 'mug' is given twice"),
+        (_with_words(("mug", " "), VECTORS), "row 1 has an empty name"),
+        (_with_words(("mug", "cup"), 0 * VECTORS), "the vector of 'mug' is zero"),
+        (_with_words((1, 2), VECTORS), "the words are .1, 2.; expected strings"),
+        (_with_words(("mug", "cup"), VECTORS * 1e300), "vectors hold NaN or infinity"),
+        (_with_words(("mug", "x" * 1001), VECTORS), "has 1001 characters; expected whole ones, at most 1000"),
+        (lambda cloud: replace(cloud, provenance={"notes": "x" * 2_100_000}), "expected at most 2097152, which"),
+        (lambda cloud: replace(cloud, provenance={"notes": "\ud800"}), "cannot be written as JSON"),
+    ],
+)
+def test_a_cloud_whose_file_would_not_open_is_not_written(tmp_path, change, says):
+    with pytest.raises(OgPointcloudError, match=says):
+        write_bundle(change(room(300)), tmp_path / "s.ogpc")
+    assert not any(tmp_path.iterdir())
+
+
 def test_nothing_is_left_behind_when_writing_fails(tmp_path):
     (tmp_path / "s.ogpc").write_bytes(b"old")
     cloud = replace(room(50), provenance={"what": object()})

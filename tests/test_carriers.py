@@ -147,6 +147,18 @@ def test_integer_and_half_precision_tensors(asked):
 # LAS out
 
 
+def test_words_may_come_as_tensors_as_a_model_gives_them(asked):
+    """With a gradient, which numpy takes from none, and of half precision."""
+    torch = pytest.importorskip("torch")
+    scene = asked[0]
+    vectors = torch.eye(2, scene.cloud.space.width).requires_grad_()
+    words = dict(zip(("a", "b"), vectors, strict=True))
+    plain = {name: vector.detach().numpy() for name, vector in words.items()}
+    expected = og.segment(scene, plain).labels.tolist()
+    assert og.segment(scene, words).labels.tolist() == expected
+    assert og.segment(scene, {name: vector.bfloat16() for name, vector in words.items()}).labels.tolist() == expected
+
+
 def test_las_keeps_labels_and_a_millimetre_at_a_million(tmp_path):
     laspy = pytest.importorskip("laspy")
     cloud = make_cloud(room(800).xyz * 300, room(800).instance_ids, 15.0, 45.0, origin=(1e6, -4e6, 350.25))

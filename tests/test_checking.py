@@ -378,6 +378,19 @@ def test_rows_of_features_that_cannot_be_right_are_told(change, says):
     assert says in doubts(scene)["features"].says
 
 
+@pytest.mark.parametrize(
+    "change", [lambda image: image / 255, lambda image: image[:, :-1], lambda image: image[..., 0]]
+)
+def test_photographs_that_cannot_be_read_are_told(change):
+    room = tiled_room()
+    scene = with_views(room, image=lambda view, index, _: change(view.image) if index in (1, 4, 5) else view.image)
+    checks = check_capture(scene)
+    [told] = [check for check in checks if check.verdict == "doubt"]
+    assert told.name == "photographs"
+    assert told.says.startswith("3 of 10 that were asked for cannot be read, and say nothing: view '")
+    assert check_capture(replace(scene, points=without_colors(scene).points))[-1].name != "photographs"
+
+
 def test_photographs_of_another_place_are_told_apart_from_wrong_poses():
     random = np.random.default_rng(0)
     other = random.integers(0, 255, (72, 96, 3), np.uint8)

@@ -324,6 +324,14 @@ def test_damaged_bytes_are_refused_or_answered(judged, tmp_path):
     assert refused > 20
 
 
+def test_a_schema_of_damaged_letters_is_refused(judged, tmp_path):
+    """SQLite quotes them in its error, which Python cannot decode."""
+    path = tmp_path / "atlas"
+    path.write_bytes(judged[1].path.read_bytes().replace(b"NOT NULL", b"NOT NUL\xec"))
+    with pytest.raises(OgPointcloudError, match=r"is no atlas that can be used .*: give an atlas, or a new name"):
+        og.Collection(path)
+
+
 def test_other_files_are_no_atlas(tmp_path):
     for content in (b"", b"text", b"SQLite format 3\0" + bytes(100)):
         (tmp_path / "atlas").write_bytes(content)

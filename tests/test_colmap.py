@@ -102,6 +102,18 @@ def test_a_count_beyond_the_file_is_refused_before_anything_is_allocated(tmp_pat
         ("cameras.txt", "PINHOLE", "BROWN", "camera 1 has the model BROWN; expected one of"),
         ("cameras.txt", "70.0", "seventy", "line 2: found 'seventy 72.0 31.0 25.5'; expected 4 numbers"),
         ("cameras.txt", " 25.5", "", "line 2: found .* expected 4 numbers"),
+        (
+            "cameras.txt",
+            "PINHOLE",
+            "SIMPLE_PINHOLE",
+            "line 2: a SIMPLE_PINHOLE with more than 3 parameters; expected f, c",
+        ),
+        (
+            "cameras.txt",
+            "1 PINHOLE",
+            "1 PINHOLE 9 9 1 1 1 1\n1 PINHOLE",
+            "two cameras have the id 1; expected files of o",
+        ),
         ("images.txt", "1 ", "one ", "line 3: found 'one 1'; expected 2 whole numbers"),
         ("images.txt", " frame_00.png", "", "line 3: found '1 .*expected ten fields, a name last"),
         ("images.txt", "frame_00.png\n\n", "frame_00.png\n", "line 4: found '2 .*expected the line of 2-D points"),
@@ -115,6 +127,17 @@ def test_damaged_text_names_the_line(tmp_path, name, find, put, message):
     (tmp_path / name).write_text(text.replace(find, put, 1))
     with pytest.raises(SceneError, match=message):
         read_all(tmp_path)
+
+
+def test_text_with_a_mark_before_it_and_other_line_ends_is_read(tmp_path):
+    write_colmap_text(tmp_path, make_world())
+    images, (xyz, rgb) = read_all(tmp_path)
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    marked, (xyz_marked, rgb_marked) = read_all(tmp_path)
+    assert [image.path for image in marked] == [image.path for image in images]
+    assert np.array_equal(xyz, xyz_marked)
+    assert np.array_equal(rgb, rgb_marked)
 
 
 def test_an_image_of_an_unknown_camera_is_refused(tmp_path):

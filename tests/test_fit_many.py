@@ -141,6 +141,12 @@ def test_circumstances_are_not_in_the_files():
     assert kept[0] == kept[1]
 
 
+@pytest.mark.parametrize("kind", [str, Path])
+def test_one_path_is_one_capture_and_not_its_letters(captures, tmp_path, kind):
+    [made] = og.fit_many(kind(captures[0]), tmp_path / "out", Inline(), progress=False)
+    assert (made.name, made.state) == (captures[0].name, "fitted")
+
+
 def test_two_captures_of_one_name_are_refused(captures, tmp_path):
     with pytest.raises(OgPointcloudError, match=r"would both become capture3.ogpc"):
         og.fit_many([captures[0], tmp_path / "capture3"], tmp_path / "out", Inline())

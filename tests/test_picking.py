@@ -207,6 +207,12 @@ def test_bad_places_are_refused(where, uv, text):
         pick(room(), where, uv)
 
 
+@pytest.mark.parametrize(("camera", "origin"), [(None, (0, 0, 0)), (AHEAD, 5), (AHEAD, np.eye(3)), (AHEAD, ("a",) * 3)])
+def test_what_is_no_camera_or_no_origin_is_refused(camera, origin):
+    with pytest.raises(OgPointcloudError, match=r"the camera is a .*; expected og.Camera and three numbers"):
+        og.in_world(camera, origin)
+
+
 def test_words_are_ranked_as_segment_scores_them():
     scene = LabelledScene.from_cloud(room())
     for instance in (0, 1, 4):

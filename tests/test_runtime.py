@@ -95,10 +95,17 @@ def test_metres_millimetres_and_map_coordinates_answer_alike(scene):
     assert (runtime.as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
 
 
-@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 2, 3))])
+@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 2, 3)), np.zeros((2, 3), complex)])
 def test_what_are_no_points_is_refused_with_its_shape(scene, points):
-    with pytest.raises(OgPointcloudError, match=re.escape(f"shape {points.shape}; expected (N, 3)")):
+    with pytest.raises(OgPointcloudError, match=re.escape(f"shape {points.shape}; expected numbers (N, 3)")):
         scene.instances_at(points)
+
+
+@pytest.mark.parametrize("points", [[["a", "b", "c"]], [[1, 2, 3], [4]], None])
+def test_what_are_no_numbers_is_refused(scene, points):
+    for ask in (scene.instances_at, scene.certainty_at):
+        with pytest.raises(OgPointcloudError, match=r"expected numbers \(N, 3\), world coordinates"):
+            ask(points)
 
 
 def test_many_points_are_asked_in_runs(scene, monkeypatch):
@@ -326,6 +333,7 @@ def test_a_files_words_come_before_the_scenes(scene):
         ({"a": np.ones(WIDTH - 1)}, FeatureSpaceError, rf"\(width {WIDTH - 1}\); expected .*\(width {WIDTH}\)"),
         ({"a": np.ones(WIDTH), "b": np.ones(3)}, FeatureSpaceError, r"'b' is float64 \(3,\)"),
         ({"a": np.ones((1, WIDTH))}, FeatureSpaceError, r"'a' is float64 \(1, 16\)"),
+        ({"a": [[1, 2], [3]]}, FeatureSpaceError, "the vector of 'a' is object"),
         ({"a": "text"}, FeatureSpaceError, "the vector of 'a'"),
         ({"a": np.zeros(WIDTH)}, FeatureSpaceError, "'a' is zero"),
         ({"a": np.ones(WIDTH), "b": np.full(WIDTH, np.nan)}, FeatureSpaceError, "'b' is NaN"),
@@ -367,6 +375,8 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
         result.mask("plum")
     with pytest.raises(OgPointcloudError, match=r"expected one of .npz, .ply, .las, .laz, .glb"):
         result.save(tmp_path / "out.txt")
+    with pytest.raises(OgPointcloudError, match=r"splats are a str; expected those of og.read_points"):
+        result.save(tmp_path / "out.glb", splats="kitchen.ply")
 
 
 def test_what_is_printed_fits_on_a_screen(scene):

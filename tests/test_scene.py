@@ -1,6 +1,8 @@
-"""Cameras: where points appear, and rotations."""
+"""Cameras: where points appear, and rotations. What a scene's records refuse."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
-from og_pointcloud.scene import Camera, Points
+from og_pointcloud.scene import Camera, Points, Scene, View
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,3 +53,54 @@ def test_rotation_of_a_quaternion(seed: int):
 def test_colors_that_are_no_bytes_are_refused(kind: type):
     with pytest.raises(SceneError, match=f"rgb is {np.dtype(kind)}; expected uint8"):
         Points(np.zeros((2, 3), np.float32), np.zeros(3), np.ones((2, 3), kind))
+
+
+@pytest.mark.parametrize(
+    ("xyz", "origin", "seen"),
+    [
+        (np.zeros((2, 3)), np.zeros(3), r"xyz is float64 \(2, 3\)"),
+        (np.zeros((2, 4), np.float32), np.zeros(3), r"xyz is float32 \(2, 4\)"),
+        (np.zeros(6, np.float32), np.zeros(3), r"xyz is float32 \(6,\)"),
+        (np.zeros((2, 3), np.float32), np.zeros(2), r"origin of shape \(2,\)"),
+    ],
+)
+def test_points_of_another_type_or_shape_are_refused(xyz: np.ndarray, origin: np.ndarray, seen: str):
+    with pytest.raises(
+        SceneError, match=seen + r".*; expected float32 \(\d, 3\) near zero and \(3,\): Points.from_world"
+    ):
+        Points(xyz, origin)
+
+
+def _view(**parts: Any) -> View:
+    camera, ids, features = (
+        Camera(4, 3, 2.0, 2.0, 2.0, 1.5, np.eye(4)),
+        np.zeros((3, 4), int),
+        np.eye(2, dtype=np.float32),
+    )
+    return View(**{"name": "a", "camera": camera, "masks": ids, "mask_features": features, **parts})
+
+
+@pytest.mark.parametrize(
+    "masks", [np.zeros((3, 4)), np.ones((3, 4), bool), np.zeros((2, 3, 4), int), np.zeros(12, int), None]
+)
+def test_masks_that_are_no_map_of_whole_numbers_are_refused(masks: Any):
+    """A boolean mask would say that mask 0 is all around it."""
+    with pytest.raises(
+        SceneError, match=r"view 'a': the mask map is .*; expected whole numbers \(3, 4\): rows of mask_fe"
+    ):
+        _view(masks=masks).mask_map()
+
+
+@pytest.mark.parametrize("image", [np.zeros((3, 4, 3)), np.zeros((3, 4), np.uint8), np.zeros((4, 3, 3), np.uint8)])
+def test_photographs_that_are_no_bytes_of_the_cameras_size_are_refused(image: np.ndarray):
+    with pytest.raises(
+        SceneError, match=r"view 'a': the image is .*; expected uint8 \(3, 4, 3\), as its camera: fix w"
+    ):
+        _view(image=image).image_rgb()
+
+
+def test_views_without_a_name_and_scenes_without_a_point_are_refused():
+    with pytest.raises(SceneError, match="a view is called 3; expected text"):
+        _view(name=3)
+    with pytest.raises(SceneError, match="the scene has 0 points; expected at least one"):
+        Scene(Points(np.zeros((0, 3), np.float32), np.zeros(3)), (_view(),), "letters")

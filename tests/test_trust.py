@@ -50,7 +50,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.fitting.memory import memory_in_use
-from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_file, write_json
+from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_json
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
@@ -358,6 +358,19 @@ def test_threads_that_write_one_path_leave_one_whole_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link to a pipe"])
+def test_what_is_no_file_is_not_replaced(tmp_path, kind):
+    """Root could replace /dev/null, and nobody would have one any more."""
+    path, pipe = tmp_path / "path", tmp_path / "pipe"
+    os.mkfifo(pipe)
+    {"folder": path.mkdir, "pipe": lambda: pipe.rename(path), "link to a pipe": lambda: path.symlink_to(pipe)}[kind]()
+    before = path.lstat()
+    with pytest.raises(OgPointcloudError, match=r"'.*path' is a folder or a device; expected a file's name"):
+        write_json(path, {})
+    assert path.lstat() == before
+    assert not any(tmp_path.glob(".*"))
+
+
 def test_temporary_names_cannot_be_guessed_and_links_are_not_followed(tmp_path, monkeypatch):
     (tmp_path / "victim").write_text("kept")
     monkeypatch.setattr("secrets.token_hex", lambda _: "00000000")
@@ -633,18 +646,6 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     changes = og.Collection.index(tmp_path / "scans", tmp_path / "atlas", progress=False).changes
     assert changes.added == ("a",)
     assert [name for name, _ in changes.left_out] == ["b"]
-
-
-def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
-    """Nor is /dev/null, by whoever may."""
-    pipe, read = tmp_path / "pipe", []
-    os.mkfifo(pipe)
-    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
-    reader.start()
-    write_file(pipe, b"written")
-    assert pipe.is_fifo()
-    reader.join()
-    assert read == [b"written"]
 
 
 def test_a_log_of_others_is_left_as_it_is(tmp_path):

@@ -109,6 +109,13 @@ def test_words_of_another_width_change_nothing_where_no_instance_is_described(tm
     assert og.load(path).vocabulary.names == tuple(WORDS)
 
 
+def test_a_word_that_no_reader_takes_changes_nothing(path, bundle_file):
+    """As of a file that is not one word a line, but one line of words."""
+    with pytest.raises(OgPointcloudError, match="has 1001 characters; expected whole ones, at most 1000"):
+        add_words(path, Vocabulary(("grape", "x" * 1001), unit_rows(2)), SPACE)
+    assert path.read_bytes() == bundle_file.read_bytes()
+
+
 def test_best_cosines_are_those_of_the_graphs_reference():
     table = instance_table(6, [0, 0, 1, 3, 3, 5])
     text = np.concatenate([4 * unit_rows(7, seed=3), np.zeros((1, WIDTH), np.float32)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -13,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
-from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member, rows_of_cameras
+from og_pointcloud.bundle.format import (
+    FORMAT,
+    INSTANCE_MEMBERS,
+    SCHEMA_VERSION,
+    describe_member,
+    manifest_json,
+    rows_of_cameras,
+)
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.bundle.vocabulary import bank_members, bank_of_encoder, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
@@ -42,8 +48,8 @@ def write_bundle(cloud: SceneLike, path: StrPath, *, text_encoder: StrPath | Non
 
     text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,
     or of the one that is found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if there is any.
-    Raises OgPointcloudError where the provenance is no JSON, where the graph disagrees with numpy, or the encoder is of
-    another feature space: then nothing is written.
+    Raises OgPointcloudError where the provenance is no JSON, or longer than readers take, as a word may be, where the
+    graph disagrees with numpy, or the encoder is of another feature space: then nothing is written.
 
     >>> import pathlib, tempfile
     >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
@@ -157,12 +163,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
         "members": {name: describe_member(name, data) for name, data in members.items()},
         "provenance": cloud.provenance,
     }  # fmt: skip
-    try:
-        return json.dumps(manifest, indent=1, ensure_ascii=False).encode()
-    except TypeError as error:
-        raise OgPointcloudError(
-            f"the cloud's provenance cannot be written as JSON ({error}): use plain types"
-        ) from None
+    return manifest_json(manifest)
 
 
 def written_by() -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from numbers import Real
 from pathlib import Path
@@ -119,6 +120,8 @@ class LabelledScene:
     def words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
         """Labels with their vectors, as ``segment`` finds them: named, in a file, in the scene's own words, encoded."""
         encoder = carried_encoder(self.path)
+        if isinstance(labels, Mapping):
+            labels = {name: numbers_of(vector) for name, vector in labels.items()}
         return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder)
 
     def known_words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
@@ -162,19 +165,21 @@ class LabelledScene:
         if self.certainty is None or points is self.xyz:
             return self.certainty
         of_points = np.append(self.certainty, np.float32(0))
-        certainty = np.zeros(len(points), np.float32)
         local = self._local(points)
+        certainty = np.zeros(len(local), np.float32)
         finite = np.isfinite(local).all(axis=1)
         certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the added 0
         return certainty
 
     def _local(self, points: NDArray[np.floating]) -> FloatArray:
         """(N, 3) in the cloud's frame; infinite where that leaves float32."""
-        points = np.asarray(points, np.float64)
-        if points.ndim != 2 or points.shape[1] != 3:
+        given = numbers_of(points)
+        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
             raise OgPointcloudError(
-                f"points have shape {points.shape}; expected (N, 3), world coordinates: one point is [[x, y, z]]"
+                f"points are {given.dtype} of shape {given.shape}; expected numbers (N, 3), world coordinates: one "
+                "point is [[x, y, z]]"
             )
+        points = np.asarray(given, np.float64)
         local = np.empty(points.shape, np.float32)
         with np.errstate(over="ignore"):
             for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own

@@ -155,7 +155,12 @@ def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
     >>> og.in_world(local, np.array([500.0, 0, 20])).center
     array([500.,   0.,  20.])
     """
-    return in_local_frame(camera, -np.asarray(origin, np.float64))
+    place = numbers_of(origin)
+    if not isinstance(camera, Camera) or place.shape != (3,) or place.dtype.kind not in "fiu":
+        raise OgPointcloudError(
+            f"the camera is a {type(camera).__name__}, the origin {origin!r:.80}; expected og.Camera and three numbers"
+        )
+    return in_local_frame(camera, -place.astype(np.float64))
 
 
 def front_points(cloud: LabelledCloud | DrawnPoints, camera: Camera) -> NDArray[np.int64]:

@@ -150,6 +150,8 @@ class Segmentation:
         path, columns = Path(path), (self.xyz, self.colors, self.attributes, self.names)
         if path.suffix not in SAVED_AS:
             raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")
+        if splats is not None and not isinstance(splats, Points):
+            raise OgPointcloudError(f"splats are a {type(splats).__name__}; expected those of og.read_points(FILE)")
         if path.suffix == ".npz":
             self._save_arrays(path)
         elif path.suffix == ".spz":

@@ -19,13 +19,15 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.scene import Camera
 
 FORMAT = "ogpc"
@@ -66,6 +68,22 @@ def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
         Camera(width, height, fx, fy, cx, cy, pose)
         for (width, height), (fx, fy, cx, cy), pose in zip(sizes, rows[:, 2:6].tolist(), poses, strict=True)
     )
+
+
+def manifest_json(manifest: Mapping[str, Any]) -> bytes:
+    """manifest.json; OgPointcloudError where the provenance is no JSON, or longer than readers take."""
+    try:
+        text = json.dumps(manifest, indent=1, ensure_ascii=False).encode()
+    except (TypeError, ValueError) as error:
+        raise OgPointcloudError(
+            f"the cloud's provenance cannot be written as JSON ({error}): use plain types"
+        ) from None
+    if len(text) > MAX_MANIFEST_BYTES:
+        raise OgPointcloudError(
+            f"the manifest has {len(text)} bytes; expected at most {MAX_MANIFEST_BYTES}, which readers take: leave "
+            "entries out of the cloud's provenance"
+        )
+    return text
 
 
 def describe_member(name: str, data: bytes) -> dict[str, Any]:

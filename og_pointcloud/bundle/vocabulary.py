@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, describe_member
+from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, MAX_NAMES_BYTES, describe_member, manifest_json
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary, WordBank, unit_rows
-from og_pointcloud.errors import FeatureSpaceError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, find_encoder, read_text_encoder
-from og_pointcloud.text.text_features import read_text_features
+from og_pointcloud.text.text_features import check_names, checked_vocabulary, read_text_features
 
 CAPTURE_WORDS = {"text_features.npz": LeftOut.VOCABULARY, "word_bank.npz": LeftOut.WORD_BANK}
 """Files of words that a capture folder may hold, and what a fit says where they are of another feature space."""
@@ -176,8 +176,12 @@ def encoder_members(folder: StrPath, space: FeatureSpace) -> tuple[dict[str, byt
 
 
 def vocabulary_members(vocabulary: Vocabulary) -> dict[str, bytes]:
-    """The members that hold words: names, and unit vectors in float32."""
+    """The members that hold words: names, and unit vectors in float32. OgPointcloudError for what no reader takes."""
+    check_names(vocabulary.names)
+    checked_vocabulary(vocabulary.names, vocabulary.vectors)
     names = json.dumps(list(vocabulary.names), ensure_ascii=False).encode()
+    if len(names) > MAX_NAMES_BYTES:
+        raise OgPointcloudError(f"the words have {len(names)} bytes; expected at most {MAX_NAMES_BYTES}: store fewer")
     vectors = unit_rows(vocabulary.vectors.astype(np.float64)).astype(np.float32)
     return {"vocabulary/names.json": names, "vocabulary/vectors.npy": npy_bytes(vectors)}
 
@@ -191,7 +195,7 @@ def _rewrite(path: StrPath, output: StrPath | None, manifest: Mapping[str, Any],
     """A bundle with some members replaced or added, and this manifest; the others are copied as they are."""
     # The manifest names all members: of those that change, bytes and checksums; the others' stay true.
     members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}
-    text = json.dumps({**manifest, "members": members}, indent=1, ensure_ascii=False).encode()
+    text = manifest_json({**manifest, "members": members})
     with zipfile.ZipFile(path) as source, replacing(output or path) as file, zipfile.ZipFile(file, "w") as target:
         target.writestr(zipfile.ZipInfo("manifest.json"), text)  # by ZipInfo, dated 1980: equal contents, equal bytes
         for name in members:

@@ -16,7 +16,7 @@ import numpy as np
 
 from og_pointcloud.checking.conversions import Repairs, best_conversion, best_mask_conversion
 from og_pointcloud.checking.masks import MaskMaps, read_mask_maps
-from og_pointcloud.checking.photographs import ALIKE, Photographs, read_photographs
+from og_pointcloud.checking.photographs import ALIKE, Photographs, read_photographs, unreadable
 from og_pointcloud.checking.registration import GROUPS, MORE_POINTS, Registration, Small
 from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
@@ -101,7 +101,7 @@ def check_capture(scene: Scene) -> list[Check]:
     if maps is not None:
         checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
         checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
-    return [*_coordinates(scene.points), *checks]
+    return [*_coordinates(scene.points), *checks, *_unreadable(sample, photographs)]
 
 
 def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
@@ -163,6 +163,17 @@ def _coordinates(points: Points) -> list[Check]:
         "export them as double, or take an offset off cloud and poses before"
     )
     return [Check("coordinates", "doubt", says)]
+
+
+def _unreadable(sample: Sample, photographs: Photographs | None) -> list[Check]:
+    """A doubt where photographs cannot be read: the fit goes on without them, as if the capture had none."""
+    used = {view.name for view in photographs.sample.views} if photographs else set()
+    asked = [view for view in sample.views if view.image is not None and sample.rgb is not None]
+    found = unreadable(view for view in asked if view.name not in used)
+    says = (
+        f"{len(found)} of {len(asked)} that were asked for cannot be read, and say nothing: {found[0]}" if found else ""
+    )
+    return [Check("photographs", "doubt", says)] if found else []
 
 
 def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:

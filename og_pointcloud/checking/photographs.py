@@ -7,7 +7,7 @@ exposure, noise and hidden points change little. Nothing else of the capture is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +89,17 @@ def read_photographs(sample: Sample) -> Photographs | None:
     return Photographs(sample, images, grids)
 
 
+def unreadable(views: Iterable[View]) -> list[str]:
+    """What is wrong with each photograph of these views that cannot be used."""
+    found = []
+    for view in views:
+        try:
+            view.image_rgb()
+        except SceneError as error:
+            found.append(str(error))
+    return found
+
+
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
     """The image (H, W, ...) reduced by averaging until its longer side has at most ``side`` pixels."""
     scale = min(1.0, side / max(image.shape[:2]))
@@ -101,7 +112,7 @@ def _resized(image: NDArray[np.generic], width: int, height: int) -> Floats:
 
 
 def _small_image(view: View) -> Floats | None:
-    """None for a photograph that shows nothing, or cannot be read: whoever needs it says so."""
+    """None for a photograph that shows nothing, or cannot be read: `unreadable` says why."""
     try:
         image = view.image_rgb()
     except SceneError:

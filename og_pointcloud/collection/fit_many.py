@@ -76,14 +76,14 @@ class CaptureFit:
 
 
 def fit_many(
-    captures: Iterable[StrPath],
+    captures: StrPath | Iterable[StrPath],
     out: StrPath,
     executor: Executor | None = None,
     *,
     options: FitOptions | None = None,
     progress: bool = True,
 ) -> tuple[CaptureFit, ...]:
-    """Fit captures, one a task, to ``out``/NAME.ogpc, NAME being the last part of a capture's path.
+    """Fit captures, or one, each a task, to ``out``/NAME.ogpc, NAME being the last part of a capture's path.
 
     executor: any of `concurrent.futures`; None: processes of this machine. Of a Dask cluster it is
     ``dask.distributed.Client(address).get_executor(pure=False)``: captures and ``out`` lie where its workers see them.
@@ -103,6 +103,8 @@ def fit_many(
             "fit_many is called while one of its own processes imports this script; expected it, and all work of a "
             "script, below if __name__ == '__main__':"
         )
+    if isinstance(captures, (str, os.PathLike)):  # the letters of a path are no captures
+        captures = [captures]
     options, out = options or FitOptions(), Path(out).resolve()
     jobs = _outputs([Path(capture).resolve() for capture in captures], out)
     fits = {

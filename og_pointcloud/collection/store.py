@@ -132,7 +132,7 @@ class Atlas:
                 connection.execute("PRAGMA trusted_schema = OFF")
                 connection.execute("PRAGMA cell_size_check = ON")
                 yield cls(path, connection)  # what is not committed when it is closed is undone
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # an error may quote bytes of the file
             raise _explained(path, str(error)) from None
 
     def _check(self) -> None:

@@ -34,15 +34,13 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
 
     Several processes may write one path at a time: each file is whole, and the last one stays. Missing folders above it
     are made; what killed runs have left of the same path is removed.
-    A device or a pipe, as /dev/null is, is written to and stays.
     durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one; False
-    for files whose readers check them. OSError names the path also where writing fails (a full disk).
+    for files whose readers check them. OSError names the path also where writing fails (a full disk). OgPointcloudError
+    where the path is a folder, or a device, which would be no more.
     """
     path = Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():
-        with path.open("wb") as file:
-            yield file
-        return
+    if path.exists() and not path.is_file():
+        raise OgPointcloudError(f"'{path}' is a folder or a device; expected a file's name, new or to be replaced")
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
     temporary = _temporary(path)

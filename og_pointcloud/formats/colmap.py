@@ -69,10 +69,14 @@ def find_model(capture: Path) -> Path | None:
 
 def read_images(model: Path) -> tuple[PosedImage, ...]:
     """The posed images of a sparse model in the file's order. Raises SceneError naming file, place and cure."""
-    cameras = {
-        camera_id: _camera(camera_model, size, values)
-        for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text)
-    }
+    cameras: dict[int, tuple[Callable[[DoubleArray], Camera], Lens | None]] = {}
+    for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text):
+        if camera_id in cameras:
+            raise SceneError(
+                f"{model}: two cameras have the id {camera_id}; expected files of one reconstruction, not of two put "
+                "together: export the model again"
+            )
+        cameras[camera_id] = _camera(camera_model, size, values)
     images = []
     for pose, camera_id, name in _records(model, "images", _images_binary, _images_text):
         if camera_id not in cameras:
@@ -137,6 +141,11 @@ def _cameras_text(file: Path) -> Iterator[CameraRecord]:
         words = [*line.split(), *[""] * 4]  # "" for fields that are missing: then it is no number, and says so
         (camera_id,), camera_model, size = _numbers(int, words[:1], place), words[1], _numbers(int, words[2:4], place)
         names = _parameters(file, camera_id, camera_model)
+        if len(line.split()) > 4 + len(names):  # as where the model's name is another's
+            raise SceneError(
+                f"{place}: a {camera_model} with more than {len(names)} parameters; expected {', '.join(names)}: name "
+                "the model that they are of"
+            )
         values = _numbers(float, words[4 : 4 + len(names)], place)
         yield camera_id, camera_model, (size[0], size[1]), dict(zip(names, values, strict=True))
 
@@ -159,7 +168,7 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
 
 def _lines(file: Path) -> Iterator[tuple[str, str, Iterator[tuple[int, str]]]]:
     """Lines that are no comments: each one's place, for errors, the line, and the numbered lines behind it."""
-    with file.open(encoding="utf-8", errors="replace") as stream:
+    with file.open(encoding="utf-8-sig", errors="replace") as stream:  # editors on Windows put a mark before the text
         lines = enumerate(stream, 1)
         for number, line in lines:
             if line.strip() and not line.startswith("#"):
@@ -266,7 +275,7 @@ def _points_text(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-            values = np.loadtxt(path, usecols=range(1, 7), ndmin=2, encoding="utf-8")
+            values = np.loadtxt(path, usecols=range(1, 7), ndmin=2, encoding="utf-8-sig")
     except ValueError as error:
         raise SceneError(
             f"{path}: {error!s:.120}; expected lines of id x y z r g b and more: export it again"
