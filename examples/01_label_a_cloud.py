@@ -33,7 +33,7 @@ print("unknown:", ", ".join(f"{count:,} {reason}" for reason, count in result.un
 # The same from PyVista: nothing to import, og_pointcloud is found through its entry points.
 mesh: Any = pv.PolyData(points).og.segment(labels, scene)
 if scene.cloud.rgb is not None:
-    mesh["RGB"] = scene.cloud.rgb  # a dataset's own colours shade those of its labels
+    mesh["RGB"] = scene.cloud.rgb  # a dataset's own colors shade those of its labels
 assert np.array_equal(mesh["og_label"], result.labels)
 mesh.save(arguments.output / "labels.vtp")  # names and the scene's path travel with it
 

@@ -72,7 +72,7 @@ BATCH, PHRASES, ABSENT, LEARNING_RATE = 64, 3, 140, 3e-3
 MADE_UP = 0.5
 """Share of the words for nothing in the room that are no words at all."""
 HUE_TURN = 0.5
-"""Radians, standard deviation, of every other mask's: things are bought in all colours, though wood and leaves are not.
+"""Radians, standard deviation, of every other mask's: things are bought in all colors, though wood and leaves are not.
 """
 SHARPNESS, WORD_SHARPNESS = 16.0, 10.0
 """Factors of the cosines in the contrastive loss, and in what keeps words apart: pieces of a table and of the floor

@@ -18,7 +18,7 @@ SIZE = np.array([4.0, 3.0, 2.5])
 WIDTH, HEIGHT, FOCAL_PX = 96, 72, 60.0
 CENTER = (45.0, 37.0)
 TILE, MASK = 0.25, 0.7
-"""Edges of tiles, which have a colour each, and of masks."""
+"""Edges of tiles, which have a color each, and of masks."""
 FEATURES = 24
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 HEADER, RECORD_HEADER, INFO = 375, 54, 160
 POINT_FORMAT, POINT_BYTES = 7, 36
-"""Three 32-bit counts to a point, times, and colours of 16 bits."""
+"""Three 32-bit counts to a point, times, and colors of 16 bits."""
 
 
 def attributes_of(labels: list[int] | np.ndarray) -> dict[str, np.ndarray]:

@@ -143,7 +143,7 @@ def room_poses(count: int = 12, offset=(0.0, 0.0, 0.0)):
 
 
 def look(pose, offset=(0.0, 0.0, 0.0), size=ROOM_SIZE, intrinsics=None):
-    """Exact depth (H, W) float64 and colours (H, W, 3) of the room. intrinsics: fx fy cx cy, pixel centres at +0.5."""
+    """Exact depth (H, W) float64 and colors (H, W, 3) of the room. intrinsics: fx fy cx cy, pixel centres at +0.5."""
     ray, eye = rays(camera(pose, size, intrinsics)), pose[:3, 3] - offset
     with np.errstate(divide="ignore"):
         to_walls = np.where(ray > 0, ROOM[1] - eye, ROOM[0] - eye) / ray

@@ -136,7 +136,7 @@ class Street:
         """(H, W, 3) uint8: what the camera sees."""
         owner, depth = self.look(camera)
         place = rays(camera) * depth[..., None] + camera.center
-        return colours(place.reshape(-1, 3), owner.ravel()).reshape(*owner.shape, 3)
+        return colors(place.reshape(-1, 3), owner.ravel()).reshape(*owner.shape, 3)
 
 
 def _along(
@@ -188,8 +188,8 @@ def _cast(low, high, round_, owner, pose, eye, intrinsics, width, height):
     return shown, nearest
 
 
-def colours(xyz: NDArray[np.floating], owner: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """(n, 3) uint8: a colour an object, in squares of half a metre, so that images can tell places apart."""
+def colors(xyz: NDArray[np.floating], owner: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """(n, 3) uint8: a color an object, in squares of half a metre, so that images can tell places apart."""
     hues = 70 + 150 * np.modf(0.618 * np.arange(owner.max(initial=0) + 1)[:, None] + np.array([0.0, 0.35, 0.6]))[0]
     palette = np.concatenate([hues, [[150, 190, 230], [95, 95, 100]]])  # SKY and GROUND are rows -2 and -1
     squares = np.floor(2 * np.clip(xyz, -FARTHEST_M, FARTHEST_M) + 0.25).astype(np.int32)
@@ -238,6 +238,6 @@ def make_street(
         features = np.array(rows, np.float32).reshape(-1, model.texts.shape[1])
         pictured = partial(street.image, camera)
         taken.append(View(f"view{index:04d}", camera, number[shown], features, pictured))
-    tint = np.concatenate([colours(xyz[part], owner[part]) for part in _chunks(len(xyz))])
+    tint = np.concatenate([colors(xyz[part], owner[part]) for part in _chunks(len(xyz))])
     cloud = Points(xyz, np.zeros(3), tint)
     return MadeStreet(Scene(cloud, tuple(taken), FEATURE_SPACE, "street"), owner)

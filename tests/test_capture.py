@@ -201,7 +201,7 @@ def test_masks_of_half_size_rule(capture):
 
 
 def test_a_shrunken_image_is_averaged(capture):
-    """Stripes a pixel wide become their mean, not one of the two colours."""
+    """Stripes a pixel wide become their mean, not one of the two colors."""
     folder, world = capture
     write_masks(folder, world.names, size=(WIDTH // 2, HEIGHT // 2))
     stripes = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -517,10 +517,10 @@ def test_real_captures(name, views):
         ids = view.mask_map()
         assert ids.min() >= -1
         assert ids.max() < view.mask_count
-        assert colour_correlation(scene.points, view) > 0.5
+        assert color_correlation(scene.points, view) > 0.5
 
 
-def colour_correlation(points, view):
+def color_correlation(points, view):
     """Correlation of the brightness of visible points with that of their pixels."""
     camera, image = view.camera, view.image_rgb()
     local = points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]

@@ -275,7 +275,7 @@ def parsed(path):
     return document, arrays
 
 
-def test_glb_holds_points_colours_and_feature_ids(tmp_path):
+def test_glb_holds_points_colors_and_feature_ids(tmp_path):
     xyz = np.random.default_rng(0).normal((1e6, -4e6, 300), 1, (40, 3))
     result = segmentation(np.arange(40) % 4 - 1, ["a", "b", "c"], xyz)
     document, arrays = parsed(result.save(tmp_path / "out.glb"))

@@ -30,7 +30,7 @@ def matrix(lens, size=4):
 
 
 def write_scannet(folder: Path):
-    """Colour at twice the depth's size with a lens of its own, as in the data set."""
+    """Color at twice the depth's size with a lens of its own, as in the data set."""
     color_lens, color_size = (260.0, 262.0, 158.0, 121.0), (2 * WIDTH, 2 * HEIGHT)
     for name in ("pose", "intrinsic"):
         (folder / name).mkdir(parents=True)
@@ -153,7 +153,7 @@ def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tm
     names = list(files)
     write_masks(tmp_path, names, SIZE)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # colour and depth are of one lens here, and said to be of two
+        warnings.simplefilter("ignore")  # color and depth are of one lens here, and said to be of two
         scene = read_capture(tmp_path)
     assert scene.views[0].camera.fx == COLOR_FOCAL_PX * WIDTH / 640
     # 65535 is "not measured", not 65 m.

@@ -225,7 +225,7 @@ def test_a_view_far_away_is_named(tmp_path):
         fuse(frames)
 
 
-def test_without_images_there_are_no_colours(tmp_path):
+def test_without_images_there_are_no_colors(tmp_path):
     assert fuse(write_frames(tmp_path, 2, colors=False)).points.rgb is None
 
 

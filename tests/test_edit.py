@@ -1,4 +1,4 @@
-"""Scene editing: what is taken, what is kept as it was, colours and harmonics against their definition, refusals."""
+"""Scene editing: what is taken, what is kept as it was, colors and harmonics against their definition, refusals."""
 
 import json
 import math
@@ -197,7 +197,7 @@ def test_a_cloud_that_cannot_be_read_is_named(scene, tmp_path, content):
         og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=tmp_path / "missing.ply")
 
 
-# Colours ----------------------------------------------------------------------------------------------------------
+# Colors ----------------------------------------------------------------------------------------------------------
 
 
 def real_harmonics(directions, count):
@@ -214,7 +214,7 @@ def real_harmonics(directions, count):
 
 
 def colors_seen(rows, directions):
-    """(directions, n, 3) colours of a 3DGS file's splats, straight from the definition."""
+    """(directions, n, 3) colors of a 3DGS file's splats, straight from the definition."""
     count = sum(name.startswith("f_rest_") for name in rows.dtype.names) // 3
     base = stacked(rows, BASE)[:, :, None]
     rest = stacked(rows, [f"f_rest_{k}" for k in range(3 * count)]).reshape(-1, 3, count) if count else base[:, :, :0]
@@ -226,7 +226,7 @@ def some_directions(count=20):
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def test_recolored_splats_shine_in_the_new_colour_from_everywhere(scene, splats, tmp_path):
+def test_recolored_splats_shine_in_the_new_color_from_everywhere(scene, splats, tmp_path):
     rows, mine = vertices(splats), scene.instance_ids == 3
     done = og.edit.recolor(scene, 3, tmp_path / "out.ply", (200, 100, 20), cloud=splats)
     after = vertices(done.path)
@@ -255,22 +255,22 @@ def test_recolored_plain_cloud(scene, tmp_path):
 
 
 @pytest.mark.parametrize("shade", [0, 5])
-def test_a_dark_object_takes_the_new_colour_too(scene, splats, tmp_path, shade):
+def test_a_dark_object_takes_the_new_color_too(scene, splats, tmp_path, shade):
     mine, color = scene.instance_ids == 3, [200, 100, 20]
     dark = dict.fromkeys(("red", "green", "blue"), np.full(len(scene.xyz), shade, np.uint8))
     plain = plain_file(tmp_path / "dark.ply", scene.xyz, **dark)
-    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=plain)
+    done = og.edit.recolor(scene, 3, tmp_path / "out.ply", color, cloud=plain)
     np.testing.assert_array_equal(stacked(vertices(done.path), dark)[mine], np.tile(color, (mine.sum(), 1)))
     rows = vertices(splats)
     for name in BASE:
         rows[name] = (shade / 255 - 0.5) / SH_CONSTANT
     write_ply(tmp_path / "splats_dark.ply", {"vertex": rows})
-    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", color, cloud=tmp_path / "splats_dark.ply")
+    done = og.edit.recolor(scene, 3, tmp_path / "out.ply", color, cloud=tmp_path / "splats_dark.ply")
     now = 0.5 + SH_CONSTANT * stacked(vertices(done.path), BASE)
     np.testing.assert_allclose(255 * now[mine], np.tile(color, (mine.sum(), 1)), atol=1e-3)
 
 
-def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_path):
+def test_colors_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_path):
     mine, n = scene.instance_ids == 3, len(scene.xyz)
     half = dict.fromkeys(("r", "g", "b"), np.linspace(0, 1, n).astype(np.float32))
     for columns, others in ((half, np.rint(np.linspace(0, 255, n))), ({}, np.full(n, 128))):
@@ -283,7 +283,7 @@ def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_pa
 
 
 @pytest.mark.parametrize("color", [(1, 2), (1, 2, 256), (-1, 0, 0), (np.nan, 0, 0)])
-def test_a_colour_that_is_none_is_refused(scene, tmp_path, color):
+def test_a_color_that_is_none_is_refused(scene, tmp_path, color):
     with pytest.raises(OgPointcloudError, match="0 to 255"):
         og.edit.recolor(scene, 3, tmp_path / "out.ply", color)
 
@@ -386,7 +386,7 @@ def test_properties_that_only_one_has_are_told(tmp_path):
     {"rgb": np.uint32([0xFF3300])},
 ], ids=["floats", "other names", "packed"])  # fmt: skip
 @pytest.mark.parametrize("turned_about", [False, True])
-def test_colours_of_other_types_stay_what_they_are(tmp_path, other, turned_about):
+def test_colors_of_other_types_stay_what_they_are(tmp_path, other, turned_about):
     ours = {name: np.uint8([value, value]) for name, value in zip(("red", "green", "blue"), (10, 20, 30), strict=True)}
     two, one = (
         plain_file(tmp_path / "a.ply", np.eye(2, 3), **ours),

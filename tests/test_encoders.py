@@ -31,11 +31,11 @@ def test_preprocessing_is_that_of_the_models_own_processor(family, side):
     image = np.random.default_rng(1).integers(0, 256, (side, side, 3), np.uint8)
     image[: side // 2] = image[: side // 2, :1]  # edges and flat parts, not noise alone
     if family == "clip":
-        processor, colours = transformers.CLIPImageProcessor(), clip.CLIP_COLORS
+        processor, colors = transformers.CLIPImageProcessor(), clip.CLIP_COLORS
     else:
         processor = transformers.SiglipImageProcessor(size={"height": 224, "width": 224}, resample=3)
-        colours = clip.SIGLIP_COLORS
-    ours = Preprocessing(224, *colours)
+        colors = clip.SIGLIP_COLORS
+    ours = Preprocessing(224, *colors)
     expected = np.asarray(processor(image, return_tensors="np", input_data_format="channels_last")["pixel_values"])
     square = mask_crops(image, np.ones((1, side, side), bool), Crop(), 224)
     levels = np.abs(ours.pixels(square) - expected) * 255 * np.array(ours.std)[:, None, None]
@@ -46,8 +46,8 @@ def test_preprocessing_is_that_of_the_models_own_processor(family, side):
 # Mask encoders
 
 
-class MeanColour:
-    """An image model that says a square's mean colour."""
+class MeanColor:
+    """An image model that says a square's mean color."""
 
     feature_space, width, preprocessing = "tests/mean", 3, Preprocessing(8, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
@@ -64,7 +64,7 @@ class MeanColour:
 
 def test_a_masks_vector_is_the_weighted_mean_of_its_crops(monkeypatch):
     monkeypatch.setattr("og_pointcloud.masking.encode.CROPS_PER_RUN", 2)
-    model = MeanColour()
+    model = MeanColor()
     crops = (Crop(1.0, 0.0, 1.0), Crop(2.0, 0.5, 0.25))
     got = CropEncoder(model, crops).embed(IMAGE, MASKS)
     assert model.runs == [2, 1, 2, 1]
@@ -84,7 +84,7 @@ def test_no_mask_is_no_row_and_an_empty_mask_an_error():
     with pytest.raises(SceneError, match="no pixel"):
         encoder.embed(IMAGE, np.zeros((1, 40, 60), bool))
     with pytest.raises(SceneError, match="0 ways to crop"):
-        CropEncoder(MeanColour(), ())
+        CropEncoder(MeanColor(), ())
 
 
 # Opening

@@ -83,7 +83,7 @@ def test_variants_of_the_trained_layout_read_the_same(tmp_path, variant):
     assert_same(read_points(write_columns(tmp_path / "b.ply", variant(raw))), expected)
 
 
-def test_colours_instead_of_harmonics_and_no_colour_at_all(tmp_path):
+def test_colors_instead_of_harmonics_and_no_color_at_all(tmp_path):
     raw = {name: column for name, column in trained_columns().items() if not name.startswith("f_")}
     assert read_points(write_columns(tmp_path / "a.ply", raw)).rgb is None
     rgb = np.random.default_rng(0).integers(0, 256, (40, 3)).astype("u1")
@@ -231,7 +231,7 @@ def compressed_elements(n: int, chunk_names: list[str]) -> dict[str, np.ndarray]
     return {"chunk": join_columns(chunk), "vertex": join_columns(vertex)}
 
 
-@pytest.mark.parametrize("chunk_names", [CHUNK + COLOR_CHUNK, CHUNK], ids=["colour bounds", "no colour bounds"])
+@pytest.mark.parametrize("chunk_names", [CHUNK + COLOR_CHUNK, CHUNK], ids=["color bounds", "no color bounds"])
 @pytest.mark.parametrize("n", [1, 256, 700])
 def test_compressed_splats_against_the_literal_decoder(tmp_path, n, chunk_names):
     elements = compressed_elements(n, chunk_names)

@@ -33,7 +33,7 @@ DATA {encoding}
 
 
 def sample(n: int) -> np.ndarray:
-    """n points; colours with alpha 0, so that they survive as decimal floats too; every fifth without a normal."""
+    """n points; colors with alpha 0, so that they survive as decimal floats too; every fifth without a normal."""
     random = np.random.default_rng(1)
     rows = np.zeros(n, DTYPE)
     for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "stamp"):
@@ -118,7 +118,7 @@ def test_decompression_undoes_a_literal_compressor(tmp_path, pattern):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_points_and_colours(tmp_path, encoding):
+def test_points_and_colors(tmp_path, encoding):
     rows = sample(50)
     points = read_points(write(tmp_path / "a.pcd", encoding, body_of(rows, encoding), len(rows)))
     np.testing.assert_allclose(points.xyz_world, np.stack([rows[c] for c in "xyz"], 1), atol=1e-6)
@@ -127,7 +127,7 @@ def test_points_and_colours(tmp_path, encoding):
 
 
 @pytest.mark.parametrize("kind", ["F", "U", "I"])
-def test_packed_colours_keep_their_bits_whatever_type_the_file_gives_them(tmp_path, kind):
+def test_packed_colors_keep_their_bits_whatever_type_the_file_gives_them(tmp_path, kind):
     # 0xFFC08040 read as a float is NaN: only its bits count.
     header = f"FIELDS x y z rgba\nSIZE 8 8 8 4\nTYPE F F F {kind}\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary\n"
     path = tmp_path / "a.pcd"

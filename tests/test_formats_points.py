@@ -25,7 +25,7 @@ def named(names: tuple[str, str, str], values: np.ndarray) -> dict[str, np.ndarr
     return dict(zip(names, values.T, strict=True))
 
 
-def test_a_cloud_without_colours_or_normals(tmp_path):
+def test_a_cloud_without_colors_or_normals(tmp_path):
     points = read_points(write_cloud(tmp_path / "a.ply"))
     np.testing.assert_allclose(points.xyz_world, XYZ, atol=1e-6)
     assert (points.rgb, points.are_gaussians) == (None, False)
@@ -46,12 +46,12 @@ def test_map_coordinates_keep_their_millimetres(tmp_path):
     [RGB, RGB.astype("u2") * 257, RGB.astype("f4") / 255, RGB.astype("f8"), RGB.astype("i4")],
     ids=["uchar", "ushort", "unit float", "float", "int"],
 )
-def test_colours_of_every_name_and_type(tmp_path, names, values):
+def test_colors_of_every_name_and_type(tmp_path, names, values):
     np.testing.assert_array_equal(read_points(write_cloud(tmp_path / "a.ply", **named(names, values))).rgb, RGB)
 
 
 @pytest.mark.parametrize("bad", [-1.0, 256.0, np.nan])
-def test_colours_out_of_range_are_refused(tmp_path, bad):
+def test_colors_out_of_range_are_refused(tmp_path, bad):
     values = RGB.astype("f4")
     values[3, 1] = bad
     with pytest.raises(SceneError, match=r"a\.ply: colors red, green, blue span .*; expected 0\.\.1 or 0\.\.255"):

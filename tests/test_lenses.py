@@ -304,7 +304,7 @@ def test_a_panorama_that_is_no_sphere_is_refused():
         spherical_camera(400, 300, np.eye(4))
 
 
-def test_colours_of_a_panorama_run_on_over_its_border():
+def test_colors_of_a_panorama_run_on_over_its_border():
     """Red is the cosine of the longitude, so the back face is dark red, without a seam."""
     longitude = (np.arange(800) + 0.5) / 800 * 2 * np.pi - np.pi
     image = np.zeros((400, 800, 3), np.uint8)

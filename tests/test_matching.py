@@ -112,9 +112,9 @@ def test_alone_is_visible_where_nothing_is_in_front() -> None:
     masks[8:28, 3:22], masks[8:28, 28:46] = 0, 1
     view = View("v", camera(), masks, np.ones((2, 3), np.float32))
     table = mask_table(gaussians, [view], NEAR)
-    colours = np.stack([RED, GREEN])
-    visible = visible_evidence(table, ids, colours, colours)
-    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, colours, 0.7)
+    colors = np.stack([RED, GREEN])
+    visible = visible_evidence(table, ids, colors, colors)
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colors, colors, 0.7)
     scores = eq5_scores(visible, table.mask_view, SETTINGS), eq5_scores(alone, table.mask_view, SETTINGS)
     assert scores[0].diagonal().min() > 0.7
     np.testing.assert_allclose(*scores, atol=0.1)
@@ -147,9 +147,9 @@ def test_alone_sees_through_what_is_in_front() -> None:
     masks[10:28, 9:41] = 0
     view = View("v", camera(), masks, np.ones((1, 3), np.float32))
     table = mask_table(gaussians, [view], NEAR)
-    colours = np.stack([RED, GREEN])
-    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, RED[None], 0.7)
-    visible = visible_evidence(table, ids, colours, RED[None])
+    colors = np.stack([RED, GREEN])
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colors, RED[None], 0.7)
+    visible = visible_evidence(table, ids, colors, RED[None])
     by_iou = MatchingSettings(score="iou")
     assert eq5_scores(alone, table.mask_view, by_iou)[0, 1] > 0.4
     assert eq5_scores(alone, table.mask_view, SETTINGS)[0, 1] == 0

@@ -266,7 +266,7 @@ def test_broken_annotation_files(tmp_path, text):
         ExistingMasks(tmp_path).of("a", (9, 9))
 
 
-def test_a_colour_png_is_refused(tmp_path):
+def test_a_color_png_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
     with pytest.raises(SceneError, match=r"is a RGB .*expected a gray PNG"):
         ExistingMasks(tmp_path).of("a", (5, 5))

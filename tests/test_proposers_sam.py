@@ -130,7 +130,7 @@ def test_preparation_is_what_transformers_own_sam_processor_does(folders, shape)
 
 
 @pytest.mark.parametrize("kind", ["sam2", "sam3"])
-def test_squares_are_resized_as_pillow_does_and_colours_come_from_the_models_file(folders, image, kind):
+def test_squares_are_resized_as_pillow_does_and_colors_come_from_the_models_file(folders, image, kind):
     from PIL import Image
 
     said = folders[kind] / "preprocessor_config.json"
@@ -144,7 +144,7 @@ def test_squares_are_resized_as_pillow_does_and_colours_come_from_the_models_fil
     assert np.abs(prepared(image, preparation)[0].numpy() - expected).max() < 1.01 / 255 / 0.5
 
 
-def test_colours_without_a_file_are_the_familys(folders):
+def test_colors_without_a_file_are_the_familys(folders):
     assert SamPredictor(folders["sam2"]).loaded.preparation.mean[0] == 0.485
     assert SamPredictor(folders["sam3"]).loaded.preparation.mean[0] == 0.5
 

@@ -181,7 +181,7 @@ def colors_seen(plotter):
     return {tuple(color) for color in np.unique(image.reshape(-1, 3), axis=0).tolist()}
 
 
-def test_a_segmentation_is_drawn_in_its_colours_with_a_legend(plotter, scene):
+def test_a_segmentation_is_drawn_in_its_colors_with_a_legend(plotter, scene):
     mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
     plotter.og.add_segmentation(mesh, names=False, legend=False)
     plotter.view_isometric()
@@ -197,7 +197,7 @@ def test_a_segmentation_is_drawn_in_its_colours_with_a_legend(plotter, scene):
     assert len([name for name in plotter.actors if name.startswith("og_segmentation")]) == 2, "drawn again, not twice"
 
 
-def test_the_datasets_own_colours_shade_those_of_the_labels(plotter, scene):
+def test_the_datasets_own_colors_shade_those_of_the_labels(plotter, scene):
     mesh = pv.PolyData(scene.xyz).og.segment(["plum"], scene)
     mesh["RGB"] = np.where(np.arange(mesh.n_points)[:, None] % 2, 255, 0).astype(np.uint8) * np.ones(3, np.uint8)
     plotter.og.add_segmentation(mesh, names=False, legend=False)
@@ -215,7 +215,7 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
     with pytest.raises(og.OgPointcloudError, match="up is"):
         plotter.og.show_labelled(mesh.og.segment(["pear"], scene), up=(0, 0, 0))
     with pytest.raises(og.OgPointcloudError, match="expected 'label' or 'instance'"):
-        plotter.og.add_segmentation(mesh, by="colour")
+        plotter.og.add_segmentation(mesh, by="color")
     with pytest.raises(og.OgPointcloudError, match=r"0 points.*cannot be drawn"):
         plotter.og.add_segmentation(pv.PolyData())
     with warnings.catch_warnings():

@@ -77,8 +77,8 @@ def test_only_the_knobs_asked_for_are_tried():
         "default", "mode: fast", "neighbours: 12", "neighbours: 48",
     ]  # fmt: skip
     assert [setting.value for setting in settings_of(("grouping sample",))] == ["", "5,000", "20,000", "all"]
-    with pytest.raises(OgPointcloudError, match="'colour' is no knob; expected one of views, mode"):
-        settings_of(("colour",))
+    with pytest.raises(OgPointcloudError, match="'color' is no knob; expected one of views, mode"):
+        settings_of(("color",))
 
 
 # Rows -----------------------------------------------------------------------------------------------------------
@@ -277,7 +277,7 @@ def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
 
 
 def test_bad_use_is_one_error(tmp_path, capsys):
-    assert "'colour' is no knob" in error_of(capsys, "report", tmp_path, "--knob", "colour")
+    assert "'color' is no knob" in error_of(capsys, "report", tmp_path, "--knob", "color")
     for name in "ab":
         (tmp_path / name / "x").mkdir(parents=True)
     error = error_of(capsys, "report", tmp_path / "a" / "x", tmp_path / "b" / "x", "-o", tmp_path / "r")

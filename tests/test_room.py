@@ -197,7 +197,7 @@ def test_without_noise_points_lie_on_surfaces_and_masks_are_objects():
 
 
 def test_points_project_to_the_centres_of_their_pixels():
-    """Pose, intrinsics, depth and colour fit together: one view's exact points fall back on their own pixels."""
+    """Pose, intrinsics, depth and color fit together: one view's exact points fall back on their own pixels."""
     settings = CaptureSettings(
         views=1, width=160, height=120, samples_per_view=3000, depth_noise=0, flying=0, outliers=0, range_m=9
     )
@@ -378,7 +378,7 @@ def test_views_stand_above_their_masks(capture, tmp_path):
 
 
 @pytest.mark.slow
-def test_label_picture_shows_the_colours_of_its_classes(capture, tmp_path):
+def test_label_picture_shows_the_colors_of_its_classes(capture, tmp_path):
     plugin = pytest.importorskip("og_pointcloud_pyvista")
     if not plugin.can_render():
         pytest.skip("PyVista cannot render off-screen here")

@@ -410,11 +410,11 @@ def test_result_is_saved_as_npz_and_ply(scene, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out.npz", "out.ply"]
 
 
-def test_colours_tell_labels_apart_and_do_not_depend_on_the_others():
-    colours = label_colors(np.arange(-1, 40))
-    assert len(np.unique(colours, axis=0)) == 41
-    assert colours[0].tolist() == [128, 128, 128]
-    assert (label_colors(np.array([5, -1, 2])) == colours[[6, 0, 3]]).all()
+def test_colors_tell_labels_apart_and_do_not_depend_on_the_others():
+    colors = label_colors(np.arange(-1, 40))
+    assert len(np.unique(colors, axis=0)) == 41
+    assert colors[0].tolist() == [128, 128, 128]
+    assert (label_colors(np.array([5, -1, 2])) == colors[[6, 0, 3]]).all()
     assert label_colors(np.zeros(0, np.int32)).shape == (0, 3)
 
 

@@ -61,8 +61,8 @@ def write_panoramas(folder, lens="EQUIRECTANGULAR", size=SIZE, circle=False):
             ids[theta > np.pi / 2] = 0
         name = f"pano_{index}"
         write_image(folder / "masks" / f"{name}.png", ids)
-        colours = np.stack([ids * 30, 255 - ids * 20, np.full_like(ids, 90)], axis=-1).astype(np.uint8)
-        write_image(folder / "images" / f"{name}.png", colours)
+        colors = np.stack([ids * 30, 255 - ids * 20, np.full_like(ids, 90)], axis=-1).astype(np.uint8)
+        write_image(folder / "images" / f"{name}.png", colors)
         features[name] = np.eye(6, 8, dtype=np.float32)
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = position

@@ -21,7 +21,7 @@ DIRECTIONS = np.linalg.qr(np.random.default_rng(0).normal(size=(WIDTH, WIDTH)))[
 
 @dataclass(frozen=True)
 class Thing:
-    """A box: its lowest corner, its size, its colour, and the row of its feature direction."""
+    """A box: its lowest corner, its size, its color, and the row of its feature direction."""
 
     low: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -124,7 +124,7 @@ def scene(
 
 
 def frames(things: list[Thing], views: list[Camera] | None = None, seed: int = 0, first: float = 0.0) -> list[og.Frame]:
-    """A visit as frames with depth, masks and colours."""
+    """A visit as frames with depth, masks and colors."""
     colors = np.array([(0, 0, 0), (128, 128, 128), *(thing.color for thing in things)], np.uint8)
     made = []
     for number, camera in enumerate(cameras() if views is None else views):

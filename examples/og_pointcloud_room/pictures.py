@@ -31,20 +31,20 @@ CLOSED = 4.5
 ASIDE = 0.12
 """How far the scene is moved to the left, in half widths: the legend is on the right."""
 
-Colours = NDArray[np.uint8]
+Colors = NDArray[np.uint8]
 
 
-def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np.integer]]) -> None:
-    """Views side by side, and under each the same with its masks in random colours.
+def draw_views(path: Path, images: Sequence[Colors], masks: Sequence[NDArray[np.integer]]) -> None:
+    """Views side by side, and under each the same with its masks in random colors.
 
     images: (H, W, 3) uint8 RGB each. masks: (H, W) each, 0 or less outside every mask.
     """
     rng = np.random.default_rng(0)
     columns = []
     for image, ids in zip(images, masks, strict=True):
-        colours = np.concatenate([[(255, 255, 255)], label_colors(rng.permutation(max(int(ids.max()), 1)))])
+        colors = np.concatenate([[(255, 255, 255)], label_colors(rng.permutation(max(int(ids.max()), 1)))])
         inside = (ids > 0)[:, :, None]
-        over = np.where(inside, 0.4 * image + 0.6 * colours[np.maximum(ids, 0)], 0.35 * image + 0.65 * 255)
+        over = np.where(inside, 0.4 * image + 0.6 * colors[np.maximum(ids, 0)], 0.35 * image + 0.65 * 255)
         smoothed = ids.astype(np.float32)
         edge = inside[:, :, 0] & (cv2.erode(smoothed, np.ones((3, 3))) != cv2.dilate(smoothed, np.ones((3, 3))))
         over[edge] = 255
@@ -55,12 +55,12 @@ def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np
 
 
 def draw_clouds(
-    path: Path, scene: LabelledScene, results: dict[str, Segmentation], rgb: Colours,
+    path: Path, scene: LabelledScene, results: dict[str, Segmentation], rgb: Colors,
     known: NDArray[np.bool_] | None = None, *, by: str = "label",
 ) -> Path:  # fmt: skip
     """Answers about one cloud beside each other, each under its title. Needs PyVista that can render off-screen.
 
-    rgb: (N, 3) colours of the points, which shade those of the labels. known: (N,) points to draw; all if left out.
+    rgb: (N, 3) colors of the points, which shade those of the labels. known: (N,) points to draw; all if left out.
     by: "label" or "instance".
     """
     import pyvista as pv

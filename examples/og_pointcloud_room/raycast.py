@@ -2,7 +2,7 @@
 
 Embree, inside Open3D, rounds as the processor likes. So it only says which triangle a ray meets; where on it is worked
 out here in float64, without matrix products, whose order of summation depends on the processor too. That makes depth,
-colour and all that follows the same on every machine, but for single pixels on an object's outline.
+color and all that follows the same on every machine, but for single pixels on an object's outline.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class RayCaster:
         self._part_owner = np.where(item < len(room.objects), item, BACKGROUND).astype(np.int32)
         materials = [part.material for item in items for part in item.parts]
         self._first, self._second, self._grain = (
-            np.array([getattr(material, name) for material in materials]) for name in ("colour", "second", "grain")
+            np.array([getattr(material, name) for material in materials]) for name in ("color", "second", "grain")
         )
 
     def look(self, intrinsics: Intrinsics, camera_to_world: Points) -> Frame:
@@ -155,7 +155,7 @@ class RayCaster:
         return Frame(camera_to_world, depth_m, self._part_owner[hits.part].reshape(shape), image.reshape(*shape, 3))
 
     def _albedo(self, xyz: Points, part: NDArray[np.int64]) -> Points:
-        """Two colours of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
+        """Two colors of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
         cell = np.floor(xyz * (NOISE_STEPS / self._grain[part])).astype(np.int64) % NOISE_SIDE
         noise = self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]].astype(np.float64)
         share = np.clip(0.5 + noise, 0, 1)[:, None]

@@ -40,7 +40,7 @@ class Room:
 
 
 def furnish(seed: int = 0) -> Room:
-    """A room of about 5 x 4.5 m with 30 to 40 objects; layout, sizes and colours follow the seed."""
+    """A room of about 5 x 4.5 m with 30 to 40 objects; layout, sizes and colors follow the seed."""
     rng = np.random.default_rng([seed, 0])
     size = (rng.uniform(4.9, 5.3), rng.uniform(4.6, 4.9), 2.6)
     makers = [sofa_group, shelf_group, cabinet_group, bed_group if rng.uniform() < 0.5 else desk_group]

@@ -1,4 +1,4 @@
-"""Solids of furniture: boxes, turned shapes and cushions as triangle meshes with a two-colour grained material.
+"""Solids of furniture: boxes, turned shapes and cushions as triangle meshes with a two-color grained material.
 
 Lengths in metres, z up. A part stands on the origin of its own frame unless it is given another base. Corners lie on a
 grid of a micrometre, so that the last bit of a sine, which depends on the processor, moves none.
@@ -20,9 +20,9 @@ GRID = 2.0**-20
 
 @dataclass(frozen=True)
 class Material:
-    """Two RGB colours in [0, 1] that value noise mixes; grain: size of its blobs along x, y, z in metres."""
+    """Two RGB colors in [0, 1] that value noise mixes; grain: size of its blobs along x, y, z in metres."""
 
-    colour: tuple[float, float, float]
+    color: tuple[float, float, float]
     second: tuple[float, float, float]
     grain: tuple[float, float, float]
 

@@ -237,7 +237,7 @@ class _Sampler:
     """Random points of a room's surfaces, evenly but for ``backdrop``; none on mirrors."""
 
     def __init__(self, room: Room, backdrop: float) -> None:
-        corners, owner, colour, weight = [], [], [], []
+        corners, owner, color, weight = [], [], [], []
         items = [*enumerate(room.objects), *((-1, item) for item in room.shell)]
         for index, item in items:
             density = backdrop if item.name in SHELL else float(item.name != MIRROR)
@@ -245,9 +245,9 @@ class _Sampler:
                 corners.append(part.vertices[part.triangles])
                 count = len(part.triangles)
                 owner.append(np.full(count, index))
-                colour.append(np.broadcast_to([part.material.colour, part.material.second], (count, 2, 3)))
+                color.append(np.broadcast_to([part.material.color, part.material.second], (count, 2, 3)))
                 weight.append(np.full(count, density))
-        self.corners, self.owner, self.colour, weights = map(np.concatenate, (corners, owner, colour, weight))
+        self.corners, self.owner, self.color, weights = map(np.concatenate, (corners, owner, color, weight))
         across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
         length = np.sqrt((across**2).sum(axis=1))  # twice the triangle's area
         self.normal = across / np.maximum(length, 1e-12)[:, None]
@@ -260,8 +260,8 @@ class _Sampler:
         first, second, third = self.corners[triangle].transpose(1, 0, 2)
         xyz = (1 - a)[:, None] * first + (a * (1 - b))[:, None] * second + (a * b)[:, None] * third
         blend = rng.random((count, 1))
-        colour = self.colour[triangle]
-        rgb = 255 * np.sqrt(0.6 * (blend * colour[:, 0] + (1 - blend) * colour[:, 1]))
+        color = self.color[triangle]
+        rgb = 255 * np.sqrt(0.6 * (blend * color[:, 0] + (1 - blend) * color[:, 1]))
         return Raw(xyz, self.normal[triangle], self.owner[triangle], rgb.astype(np.uint8), np.zeros_like(xyz))
 
 

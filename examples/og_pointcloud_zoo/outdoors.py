@@ -217,7 +217,7 @@ class Scanner:
         surfaces = Surfaces(self.room.objects)
         names = [item.name for item in self.room.objects]
         tones = [part.material for item in self.room.objects for part in item.parts]
-        albedo = np.array([(tone.colour, tone.second) for tone in tones])
+        albedo = np.array([(tone.color, tone.second) for tone in tones])
         softness = np.array([self.soft.get(name, 0.0) for name in names])
         found = []
         for origin, moved in zip(self.origins, self.drift, strict=True):

@@ -52,7 +52,7 @@ def write_gltf(
 
     xyz_world: (n, 3), n at least 1; stored as float32 around their median, which is the node's translation. Axes stay
         as they are: glTF takes y to be up, so turn a scene with z up in the viewer.
-    rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colours.
+    rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colors.
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8. Ids below 0 become the
         feature id that says "none"; og_reason tells which none.
     names: what og_label counts.

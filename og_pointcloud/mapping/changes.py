@@ -46,7 +46,7 @@ from og_pointcloud.rendering.geometry import nearest_in
 SAME_SURFACE = 1.5
 """Spacings within which two visits' points are of one surface."""
 USUAL_COLORS = 3.0
-"""The colour of one thing may differ by so many times as much as that of the median thing which has not moved."""
+"""The color of one thing may differ by so many times as much as that of the median thing which has not moved."""
 LEAST_STILL = 0.05
 """Share of all points looked at, hidden ones among them, that must be where they were: else it is another frame."""
 SMALL_PIECE = 0.5
@@ -258,7 +258,7 @@ def _unmoved(
 
 
 def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
-    """What cosines and colours mean, by what has not moved, (m, 2): how alike the two visits show each thing, and how
+    """What cosines and colors mean, by what has not moved, (m, 2): how alike the two visits show each thing, and how
     alike it is to the other thing that is most like it."""
     a, b = earlier.cloud.instances, later.cloud.instances
     # Adjoining instances may be parts of one thing: they are no other things.
@@ -276,7 +276,7 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     one, two = earlier.cloud.rgb, later.cloud.rgb
     if one is None or two is None:
         return Scale(same, other)
-    # Other light shifts all colours alike; what is left differs from thing to thing.
+    # Other light shifts all colors alike; what is left differs from thing to thing.
     pairs = ((one[earlier.rows[i]], two[later.rows[k]]) for i, k in unmoved.tolist())
     off = np.array([np.median(now, axis=0) - np.median(was, axis=0) for was, now in pairs])
     shift = np.median(off, axis=0)
@@ -308,7 +308,7 @@ def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, i
 def _gathered(
     gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale
 ) -> tuple[list[_Thing], list[_Thing], dict[int, int]]:
-    """Gone, new and pairs after what moved has taken in its other pieces: instances that look like it, have its colour,
+    """Gone, new and pairs after what moved has taken in its other pieces: instances that look like it, have its color,
     and lie no farther off than it is long. Of those that left, only small ones: a large one that stood beside it may
     have been another of its kind. Things whose pieces were taken stay in the lists, empty."""
     gone, new, pairs = list(gone), list(new), dict(pairs)

@@ -1,4 +1,4 @@
-"""Whether two instances, of two visits, are the same thing: by descriptor, colour and size.
+"""Whether two instances, of two visits, are the same thing: by descriptor, color and size.
 
 A descriptor is the mean of m mask features. Let each of them have the cosine a with the mean over infinitely many
 views: then the descriptor deviates from that mean by an angle whose tangent is about sqrt(s), s = (1 - a^2) / (a^2 m).
@@ -7,7 +7,7 @@ So two descriptors of one thing do not reach the cosine 1, but
     c = 1 / sqrt((1 + s) (1 + s'))
 
 and a cosine divided by c is what infinitely many views would give. What such a cosine means is learned from the scene
-itself: how alike the two visits show what has not moved, and how alike that is to other things that stand there. Colour
+itself: how alike the two visits show what has not moved, and how alike that is to other things that stand there. Color
 and size can only rule a match out: exposure, shade and what was hidden change both.
 """
 
@@ -23,7 +23,7 @@ from og_pointcloud.cloud import InstanceTable, best_of_rows
 ALIKE = 0.5
 """Likeness from which on two are one thing: halfway between 0, as of different things, and 1, as of one thing."""
 OTHER_COLOR = 48.0
-"""Levels of 255 in any channel; if median colours differ by more, it is another thing."""
+"""Levels of 255 in any channel; if median colors differ by more, it is another thing."""
 SAME_COLOR = 24.0
 """Levels up to which two adjoining parts may be of one thing."""
 OTHER_SIZE = 5.0
@@ -69,8 +69,8 @@ class Look:
         return cls(descriptors, spread, place, color, bounds, float(sides.max()))
 
     def has_color_of(self, other: Look, most: float = SAME_COLOR, shift: NDArray[np.float64] | float = 0.0) -> bool:
-        """Whether the two may be of one thing by their colours; True where these are not known. shift: difference that
-        all colours of the other's visit have, as under other light."""
+        """Whether the two may be of one thing by their colors; True where these are not known. shift: difference that
+        all colors of the other's visit have, as under other light."""
         if self.color is None or other.color is None:
             return True
         return bool(np.abs(other.color - self.color - shift).max() <= most)
@@ -79,8 +79,8 @@ class Look:
 @dataclass(frozen=True)
 class Scale:
     """What cosines mean in a scene; all are corrected for spread, as in the module's text. same: typical cosine of one
-    thing in two visits. other: of different things. shift: (3,) by how much all later colours differ; color: levels,
-    beyond that shift, up to which two colours may be of one thing."""
+    thing in two visits. other: of different things. shift: (3,) by how much all later colors differ; color: levels,
+    beyond that shift, up to which two colors may be of one thing."""
 
     same: float = 1.0
     other: float = 0.0
@@ -88,7 +88,7 @@ class Scale:
     color: float = OTHER_COLOR
 
     def likeness(self, one: Look, later: Look) -> float:
-        """How likely the two are one thing: about 1 for one, 0 for two different ones, -inf where size or colour rule
+        """How likely the two are one thing: about 1 for one, 0 for two different ones, -inf where size or color rule
         it out."""
         # What rules a match out comes first; only then do descriptors count.
         longer, shorter = max(one.length, later.length), min(one.length, later.length)

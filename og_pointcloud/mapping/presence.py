@@ -226,7 +226,7 @@ class Evidence:
         )
         most = through > MOST * (through + still)
         # The underside of what lies flat agrees with the table below when it is gone: there, only points off the table
-        # count against those seen through. Without that majority, these must be a fair share, and of the rest's colour.
+        # count against those seen through. Without that majority, these must be a fair share, and of the rest's color.
         lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
         for k in np.flatnonzero(lies_flat):
             lies_flat[k] = self._of_one_color(visit, int(k))
@@ -256,7 +256,7 @@ class Evidence:
         return share
 
     def _of_one_color(self, visit: Visit, instance: int) -> bool:
-        """Whether the points seen through have the colour of the rest: else they are a part of something else."""
+        """Whether the points seen through have the color of the rest: else they are a part of something else."""
         rows = visit.rows[instance]
         rows = rows[self.shown[rows]]
         return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))

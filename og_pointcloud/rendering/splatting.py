@@ -6,7 +6,7 @@ those weights up over the pixels of each mask, tile by tile while compositing; `
 
     A[i, g] = sum over pixels p of mask i of W[p, g]
 
-It knows nothing of colours or features: what a view shows of any value is a product with these sparse rows. A map
+It knows nothing of colors or features: what a view shows of any value is a product with these sparse rows. A map
 that gives every pixel its own id makes ``A`` the weights ``W`` themselves.
 
 Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces

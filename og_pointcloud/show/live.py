@@ -139,7 +139,7 @@ class LiveScene:
         return f"{words[0][0]}?" if words else f"instance {instance}"
 
     def _painted(self) -> NDArray[np.uint8]:
-        """Colours of labels or instances, lighter and darker as the points' own are."""
+        """Colors of labels or instances, lighter and darker as the points' own are."""
         count = len(self.scene.cloud.instances)
         table = np.full((len(self.label_of), 3), NO_LABEL, np.uint8)
         own = label_colors(np.arange(count))

@@ -115,15 +115,15 @@ def _draw(panel: Any, case: Case, rows: Sequence[Row]) -> None:
     rows = [row for row in rows if row.value]  # a logarithmic axis has no zero
     values = np.array([row.value for row in rows], np.float64)
     panel.axhline(max(case.bound, FLOOR), color=BOUND, linewidth=1, linestyle=(0, (4, 3)), label="bound", zorder=1)
-    for name, colour, errors in (
+    for name, color, errors in (
         ("naive float32", NAIVE, [row.naive for row in rows]),
         ("og_pointcloud", OURS, [row.error for row in rows]),
     ):
         error = np.array([np.nan if e is None else e for e in errors], np.float64)
         lost = ~np.isfinite(error)
         shown = np.where(lost, TOP, np.maximum(error, FLOOR))
-        panel.loglog(values, shown, color=colour, marker="o", markersize=3.5, linewidth=1.6, label=name, zorder=3)
-        panel.plot(values[lost], shown[lost], "x", color=colour, markersize=8, markeredgewidth=2, zorder=4)
+        panel.loglog(values, shown, color=color, marker="o", markersize=3.5, linewidth=1.6, label=name, zorder=3)
+        panel.plot(values[lost], shown[lost], "x", color=color, markersize=8, markeredgewidth=2, zorder=4)
     panel.set_ylim(FLOOR / 3, TOP * 8)
     ticks = {FLOOR: r"$\leq 10^{-12}$", 1e-9: "$10^{-9}$", 1e-6: "$10^{-6}$", 1e-3: "$10^{-3}$", 1: "1", TOP: "NaN"}
     panel.set_yticks(list(ticks), list(ticks.values()))
