@@ -1,4 +1,4 @@
-"""How sure is each point: what a threshold keeps, and where views and neighbours disagree, as a picture."""
+"""How sure is each point: what a threshold keeps, and where views and neighbors disagree, as a picture."""
 
 import argparse
 from pathlib import Path

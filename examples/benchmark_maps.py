@@ -163,7 +163,7 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
 
 
 def speed(folder: Path, options: argparse.Namespace) -> None:
-    """Milliseconds a frame in maps of SIZES points: on the way from the capture's to their neighbours."""
+    """Milliseconds a frame in maps of SIZES points: on the way from the capture's to their neighbors."""
     capture, frames = frames_of(folder, options)
     xyz, random = capture.points.xyz_world, np.random.default_rng(0)
     near = np.asarray(cKDTree(xyz).query(xyz, k=5, workers=-1)[1])

@@ -89,7 +89,7 @@ def capture_case(folder: Path) -> Case:
     middle = scene.views[len(scene.views) // 2]
     surface = prepare(replace(scene, views=scene.views[:: max(1, len(scene.views) // 10)])).surface
     view = thinned(middle, surface.stride)
-    thickness = (6 * surface.neighbourhood.spacing).astype(np.float32)
+    thickness = (6 * surface.neighborhood.spacing).astype(np.float32)
     name = f"{folder.name}, {len(scene.points):,}"
     return Case(name, surface.gaussians, view.camera, view.mask_map(), view.mask_count, surface.near, thickness)
 

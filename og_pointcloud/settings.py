@@ -15,7 +15,7 @@ from og_pointcloud.errors import OgPointcloudError
 
 ABOVE_ZERO = {
     "coarse_interval", "crossing", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
-    "kinds", "lloyd_rounds", "memory", "neighbours", "opacity", "reach", "rounds", "scale", "scales", "schedule_share",
+    "kinds", "lloyd_rounds", "memory", "neighbors", "opacity", "reach", "rounds", "scale", "scales", "schedule_share",
     "sharpness", "synonym", "tile_points", "width",
 }  # fmt: skip
 """Numbers that 0 would make meaningless; none may be negative."""
@@ -79,8 +79,8 @@ class GeometrySettings(_Checked):
     enough_views: int = 24
     """Views that see a point; further ones are left out where what they and their masks show is shown by so many others
     (coverage.py)."""
-    neighbours: int = 24
-    """Nearest points of each point among which its neighbours are looked for."""
+    neighbors: int = 24
+    """Nearest points of each point among which its neighbors are looked for."""
     reach: float = 3.0
     """Points within this many spacings adjoin; farther than this from the cloud is "too far"."""
 
@@ -115,7 +115,7 @@ class MembershipSettings(_Checked):
     sure_votes: float = 0.1
     """And when this share of all votes on it are for the instance, those of views without a mask of it among them."""
     open_share: float = 0.7
-    """A point that is seen less than this share as openly as the scene's others follows its neighbours, the more so the
+    """A point that is seen less than this share as openly as the scene's others follows its neighbors, the more so the
     less openly it is seen."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
@@ -131,10 +131,10 @@ class MembershipSettings(_Checked):
     """A separate piece whose points show less than this share of what the main piece's do was seen through the main
     piece, and is not part of it."""
     own_vote: float = 3.0
-    """Votes of a point for its own state; a sure neighbour has one, if colors say nothing of the two."""
+    """Votes of a point for its own state; a sure neighbor has one, if colors say nothing of the two."""
     crossing: float = 2.0
     """It takes so many times more votes to cross between background and an instance: a background point has so many
-    times the votes for its own state, and to an instance's point background neighbours count so many times less."""
+    times the votes for its own state, and to an instance's point background neighbors count so many times less."""
     gap_sizes: float = 0.5
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2

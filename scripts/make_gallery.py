@@ -55,7 +55,7 @@ EXHIBITS = (
     Exhibit("08_edit_a_scene", ("{scene}", "-o", "{out}"), ("edited.png",),
             "As it was; sofa and cushions removed; the table red; one more chair. White is what no camera ever saw."),
     Exhibit("09_how_sure", ("{scene}", "-o", "{out}"), ("how_sure.png",),
-            "Dark is where views or neighbours disagree: borders, and the floor seen between legs."),
+            "Dark is where views or neighbors disagree: borders, and the floor seen between legs."),
     Exhibit("10_second_visit", ("-o", "{out}"), ("growing.png", "changes.png"),
             "The map after 6, 18, 36 and 60 frames; then the next day: the vase left, the ball came, the chair was "
             "moved and keeps its id. White, and the seat below the table, is what no frame looked at."),

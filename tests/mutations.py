@@ -90,7 +90,7 @@ MUTATIONS = (
         "vote * of_background if", "vote if", ("test_membership.py",),
     ),
     Mutation(
-        "neighbours heard once", "fitting/membership.py",
+        "neighbors heard once", "fitting/membership.py",
         "ROUNDS = 2", "ROUNDS = 1", MEMBERSHIP,
     ),
     Mutation(
@@ -99,7 +99,7 @@ MUTATIONS = (
         (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
-        "neighbours heard whatever their color", "fitting/membership.py",
+        "neighbors heard whatever their color", "fitting/membership.py",
         "vote = voice[other] * weights[g, k]", "vote = voice[other]", (*MEMBERSHIP, "test_colors.py"),
     ),
     Mutation(
@@ -155,7 +155,7 @@ MUTATIONS = (
         "(support.votes > settings.sure_votes * total)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
-        "certainty without the neighbours", "fitting/membership.py",
+        "certainty without the neighbors", "fitting/membership.py",
         "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
     ),
     # Grouping, association.

@@ -41,7 +41,7 @@ def least_volume_plainly(xyz):
 
 
 def least_area_plainly(flat):
-    """Each pair of neighbouring hull corners in turn as the direction of a side."""
+    """Each pair of neighboring hull corners in turn as the direction of a side."""
     corners = flat[ConvexHull(flat).vertices]
     sides = [(b - a) / np.linalg.norm(b - a) for a, b in itertools.pairwise([*corners, corners[0]])]
     return min(np.ptp(corners @ side) * np.ptp(corners @ [-side[1], side[0]]) for side in sides)

@@ -158,8 +158,8 @@ def test_the_error_of_a_gap_counts_groups_and_not_comparisons():
 
 @pytest.mark.skipif(not TABLE.exists(), reason="the capture ycb_0050 is not here")
 @pytest.mark.parametrize("views", [3, 4])
-def test_neighbouring_views_whose_photographs_are_nearly_alike_raise_no_doubt(views):
-    """A drawing fits its neighbours' photographs nearly as well as its own, which it fits as well as can be."""
+def test_neighboring_views_whose_photographs_are_nearly_alike_raise_no_doubt(views):
+    """A drawing fits its neighbors' photographs nearly as well as its own, which it fits as well as can be."""
     scene = og.read_capture(TABLE)
     assert not doubts(replace(scene, views=scene.views[:views]))
 

@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 from test_membership import groups, on_a_line
 
-from og_pointcloud.fitting.colors import DIFFERENCES, MOST, color_ratios, neighbour_weights
+from og_pointcloud.fitting.colors import DIFFERENCES, MOST, color_ratios, neighbor_weights
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import view_votes
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SIDE = 24
 DARK, LIGHT = (40, 30, 30), (90, 120, 60)
 
 
-def grid(random: Generator, side: int = SIDE) -> tuple[Neighbourhood, NDArray[np.int32], NDArray[np.float64]]:
-    """The neighbourhood of a square of points, half of them of state 0, half of state 1, most of them sure in part."""
+def grid(random: Generator, side: int = SIDE) -> tuple[Neighborhood, NDArray[np.int32], NDArray[np.float64]]:
+    """The neighborhood of a square of points, half of them of state 0, half of state 1, most of them sure in part."""
     x, y = np.meshgrid(np.arange(side), np.arange(side))
     xyz = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) + random.normal(0, 0.05, (side**2, 3))
     return (
-        neighbourhood(xyz.astype(np.float32), GeometrySettings()),
+        neighborhood(xyz.astype(np.float32), GeometrySettings()),
         (x.ravel() >= side // 2).astype(np.int32),
         np.where(random.random(side**2) < 0.8, random.uniform(0.6, 1, side**2), 0),
     )
@@ -36,7 +36,7 @@ def colored(ids: NDArray[np.int32], random: Generator, noise: float) -> NDArray[
     return np.clip(np.array([DARK, LIGHT])[ids] + random.normal(0, noise, (len(ids), 3)), 0, 255).astype(np.uint8)
 
 
-def lists(around: Neighbourhood) -> list[list[int]]:
+def lists(around: Neighborhood) -> list[list[int]]:
     return [index[near].tolist() for index, near in zip(around.index, around.adjoining, strict=True)]
 
 
@@ -67,7 +67,7 @@ def test_colors_that_say_nothing_weigh_nothing(same: bool) -> None:
     around, ids, sure = grid(random)
     rgb = np.full((SIDE**2, 3), 7, np.uint8) if same else random.integers(0, 255, (SIDE**2, 3)).astype(np.uint8)
     found = color_ratios(rgb, ids, sure, around)
-    weights = neighbour_weights(rgb, around, found)
+    weights = neighbor_weights(rgb, around, found)
     assert (weights[~around.adjoining] == 0).all()
     assert np.median(weights[around.adjoining]) == pytest.approx(1, abs=0.25)
 
@@ -79,7 +79,7 @@ def test_a_scene_without_colors_or_without_borders_is_not_asked() -> None:
         found = color_ratios(rgb, states, sure, around)
         assert found.shape == (DIFFERENCES,)
         assert (found == 1).all()
-        assert np.array_equal(neighbour_weights(rgb, around, found), around.adjoining)
+        assert np.array_equal(neighbor_weights(rgb, around, found), around.adjoining)
 
 
 def test_order_of_points_does_not_matter() -> None:
@@ -87,7 +87,7 @@ def test_order_of_points_does_not_matter() -> None:
     around, ids, sure = grid(random)
     rgb, order = colored(ids, random, 20), random.permutation(SIDE**2)
     back = np.argsort(order)
-    shuffled = Neighbourhood(around.spacing[order], back[around.index[order]].astype(np.int32), around.adjoining[order])
+    shuffled = Neighborhood(around.spacing[order], back[around.index[order]].astype(np.int32), around.adjoining[order])
     found = color_ratios(rgb, ids, sure, around)
     assert np.array_equal(found, color_ratios(rgb[order], ids[order], sure[order], shuffled))
 
@@ -101,7 +101,7 @@ def test_points_of_a_torn_border_go_with_their_color(tell: bool) -> None:
     reach = np.where((truth == 1) & (np.arange(n) % size < 2), thing - 1, thing)
     views = [[(np.flatnonzero(shown == k).tolist(), ONE) for k in range(n // size)] for shown in (thing, reach, reach)]
     table = hand_table(n, views)
-    around = neighbourhood(on_a_line(n), GeometrySettings())
+    around = neighborhood(on_a_line(n), GeometrySettings())
     rgb = np.array([DARK, LIGHT], np.uint8)[truth] if tell else np.full((n, 3), 9, np.uint8)
     number = groups([k for _ in views for k in range(n // size)])
     ids = assign_points(table, view_votes(table), number, around, MembershipSettings(), rgb).instance_ids

@@ -147,7 +147,7 @@ def test_a_word_bank_lets_a_text_select_nothing(data):
 
 
 def test_transparent_gaussians_show_nothing(data):
-    """An alpha of 0.7 is asked for: at opacity 0.4, 0.59 with its neighbours, even the right instance has no pixel."""
+    """An alpha of 0.7 is asked for: at opacity 0.4, 0.59 with its neighbors, even the right instance has no pixel."""
     scene = og.load(data / "p/figurines.ogpc")
     write_gaussians(data / "soft.ply", scene.cloud, 0.4)
     labels = read_scene(data / "d", "figurines")

@@ -391,7 +391,7 @@ def test_prepare_gives_what_later_stages_need(known: Known) -> None:
     n = len(known.truth)
     assert prepared.table.weights.shape == (8 * BOXES, n)
     assert prepared.table.outside.shape == prepared.table.exposure.shape == (8, n)
-    assert len(prepared.surface.gaussians) == len(prepared.surface.neighbourhood.spacing) == n
+    assert len(prepared.surface.gaussians) == len(prepared.surface.neighborhood.spacing) == n
     pixels = np.concatenate([np.bincount(view.mask_map()[view.mask_map() >= 0]) for view in known.scene.views])
     np.testing.assert_allclose(prepared.table.mask_pixels.sum(), pixels.sum(), rtol=0.05)
 

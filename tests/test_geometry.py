@@ -20,7 +20,7 @@ from og_pointcloud.rendering.geometry import (
     drawn_spacing,
     near_plane,
     nearest_in,
-    neighbourhood,
+    neighborhood,
     sample_of_points,
     strided,
 )
@@ -38,17 +38,17 @@ def grid(side: int, step: float = 1.0) -> NDArray[np.float32]:
 
 
 def test_spacing_of_a_lattice_is_its_step() -> None:
-    around = neighbourhood(grid(10, 0.25), SETTINGS)
+    around = neighborhood(grid(10, 0.25), SETTINGS)
     assert around.spacing.dtype == np.float32
     np.testing.assert_allclose(np.median(around.spacing), 0.25)
 
 
-def test_neighbours_are_those_of_brute_force(random: Generator) -> None:
+def test_neighbors_are_those_of_brute_force(random: Generator) -> None:
     xyz = random.normal(size=(200, 3)).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
+    around = neighborhood(xyz, SETTINGS)
     apart = np.linalg.norm(xyz[:, None].astype(np.float64) - xyz, axis=2)
     np.fill_diagonal(apart, np.inf)
-    nearest = np.argsort(apart, axis=1)[:, : SETTINGS.neighbours]
+    nearest = np.argsort(apart, axis=1)[:, : SETTINGS.neighbors]
     np.testing.assert_array_equal(around.index, nearest)
     own = np.take_along_axis(apart, nearest, axis=1)
     three = own[:, :3].mean(axis=1)
@@ -61,7 +61,7 @@ def test_neighbours_are_those_of_brute_force(random: Generator) -> None:
 def test_order_of_points_does_not_matter(random: Generator) -> None:
     xyz = random.normal(size=(300, 3)).astype(np.float32)
     order = random.permutation(300)
-    plain, shuffled = neighbourhood(xyz, SETTINGS), neighbourhood(xyz[order], SETTINGS)
+    plain, shuffled = neighborhood(xyz, SETTINGS), neighborhood(xyz[order], SETTINGS)
     np.testing.assert_array_equal(shuffled.spacing, plain.spacing[order])
     np.testing.assert_array_equal(order[shuffled.index], plain.index[order])
     np.testing.assert_array_equal(shuffled.adjoining, plain.adjoining[order])
@@ -69,14 +69,14 @@ def test_order_of_points_does_not_matter(random: Generator) -> None:
 
 def test_unit_of_length_scales_the_spacing(random: Generator) -> None:
     xyz = random.normal(size=(300, 3)).astype(np.float32)
-    metres, millimetres = neighbourhood(xyz, SETTINGS), neighbourhood(xyz * np.float32(1024), SETTINGS)
+    metres, millimetres = neighborhood(xyz, SETTINGS), neighborhood(xyz * np.float32(1024), SETTINGS)
     np.testing.assert_array_equal(millimetres.spacing, metres.spacing * 1024)
     np.testing.assert_array_equal(millimetres.adjoining, metres.adjoining)
 
 
 def test_a_floater_has_the_spacing_of_the_surface_it_left() -> None:
     xyz = np.concatenate([grid(10), [[4, 4, 500]]]).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
+    around = neighborhood(xyz, SETTINGS)
     assert around.spacing[-1] <= 1.5
     assert not around.adjoining[-1].any()
     assert not (around.adjoining & (around.index == 100)).any()
@@ -88,18 +88,18 @@ def test_only_points_that_float_far_apart_in_all_directions_are_drawn_small(rand
     wall[:, 1] += random.normal(500, 1, 64)
     floaters = random.uniform([0, 0, 100], [40, 40, 140], (64, 3))
     xyz = np.concatenate([floor, wall, floaters]).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
+    around = neighborhood(xyz, SETTINGS)
     drawn = drawn_spacing(xyz, around)
-    assert np.median(around.spacing[1664:]) > 3, "they are no neighbours of the floor"
+    assert np.median(around.spacing[1664:]) > 3, "they are no neighbors of the floor"
     assert np.mean(np.isclose(drawn[1664:], FLOATER)) > 0.8, (
-        "but for some at their rim, whose neighbours lie to one side"
+        "but for some at their rim, whose neighbors lie to one side"
     )
     np.testing.assert_array_equal(drawn[:1664], around.spacing[:1664])
 
 
 def test_duplicates_have_the_spacing_of_the_scene() -> None:
     xyz = np.concatenate([grid(10), np.repeat(grid(1) + 3, 40, axis=0)]).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
+    around = neighborhood(xyz, SETTINGS)
     np.testing.assert_allclose(around.spacing[100:], 1, atol=0.2)
     assert (around.spacing > 0).all()
     assert (around.index != np.arange(140)[:, None]).all()
@@ -109,12 +109,12 @@ def test_duplicates_have_the_spacing_of_the_scene() -> None:
 def test_points_given_twice_have_the_spacing_they_had(random: Generator) -> None:
     xyz = random.normal(size=(300, 3)).astype(np.float32)
     again = np.concatenate([np.arange(300), np.arange(300), np.arange(0, 300, 3)])
-    once, twice = neighbourhood(xyz, SETTINGS), neighbourhood(xyz[again], SETTINGS)
+    once, twice = neighborhood(xyz, SETTINGS), neighborhood(xyz[again], SETTINGS)
     np.testing.assert_array_equal(twice.spacing, once.spacing[again])
 
 
 def test_only_duplicates() -> None:
-    around = neighbourhood(np.ones((50, 3), np.float32), SETTINGS)
+    around = neighborhood(np.ones((50, 3), np.float32), SETTINGS)
     np.testing.assert_array_equal(around.spacing, 1)
     assert around.adjoining.all()
 
@@ -135,15 +135,15 @@ def test_points_of_one_place_keep_their_order_along_the_curve(n: int) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, 18])
-def test_few_points_have_all_others_as_neighbours(n: int) -> None:
+def test_few_points_have_all_others_as_neighbors(n: int) -> None:
     xyz = np.stack([np.arange(n), np.zeros(n), np.zeros(n)], axis=1).astype(np.float32)
-    around = neighbourhood(xyz, SETTINGS)
-    assert around.index.shape == around.adjoining.shape == (n, min(n - 1, SETTINGS.neighbours))
+    around = neighborhood(xyz, SETTINGS)
+    assert around.index.shape == around.adjoining.shape == (n, min(n - 1, SETTINGS.neighbors))
     assert around.index.dtype == np.int32
     assert ((around.spacing >= 1) & (around.spacing <= 2)).all()
-    for point, neighbours in enumerate(around.index):
-        assert set(neighbours) <= set(range(n)) - {point}
-        assert len(set(neighbours)) == len(neighbours)
+    for point, neighbors in enumerate(around.index):
+        assert set(neighbors) <= set(range(n)) - {point}
+        assert len(set(neighbors)) == len(neighbors)
 
 
 @pytest.mark.parametrize(("width", "height", "stride"), [(50, 37, 1), (50, 37, 2), (50, 37, 3), (7, 4, 3), (2, 2, 2)])
@@ -216,7 +216,7 @@ def test_chance_of_place_is_even_and_another_for_each_name() -> None:
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
 
 
-def test_ctrl_c_waits_for_threads_that_are_looking_up_neighbours() -> None:
+def test_ctrl_c_waits_for_threads_that_are_looking_up_neighbors() -> None:
     class Tree:
         ended = False
 
@@ -236,11 +236,11 @@ def test_ctrl_c_waits_for_threads_that_are_looking_up_neighbours() -> None:
     assert tree.ended  # else scipy's threads would go on in memory that is gone, and end the process
 
 
-def test_neighbours_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbors_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = np.random.default_rng(5).random((300, 3)).astype(np.float32)
     xyz[7] = xyz[200]  # a duplicate: the point itself is not always the first found
-    at_once = neighbourhood(xyz, GeometrySettings())
+    at_once = neighborhood(xyz, GeometrySettings())
     monkeypatch.setattr(geometry, "ROWS_AT_ONCE", 37)
-    few = neighbourhood(xyz, GeometrySettings())
+    few = neighborhood(xyz, GeometrySettings())
     for name in ("spacing", "index", "adjoining"):
         np.testing.assert_array_equal(getattr(few, name), getattr(at_once, name))

@@ -16,7 +16,7 @@ from og_pointcloud.fitting import held_out
 from og_pointcloud.fitting.held_out import CLEARLY, STEP, agreement, choose_scale, search
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.geometry import near_plane, neighbourhood
+from og_pointcloud.rendering.geometry import near_plane, neighborhood
 from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
@@ -29,7 +29,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 def chosen(scene: Scene, settings: FitSettings | None = None):
     settings = settings or FitSettings()
-    spacing = neighbourhood(scene.points.xyz, settings.geometry).spacing
+    spacing = neighborhood(scene.points.xyz, settings.geometry).spacing
     near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
     thickness = sight_thickness(spacing, float(np.median(spacing)), settings.geometry)
     return choose_scale(scene.points, spacing, thickness, scene.views, near, settings, Journal(progress=False))

@@ -21,7 +21,7 @@ from og_pointcloud.mapping.frame_queue import FrameQueue
 from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
-from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.geometry import neighborhood
 
 THINGS = [CHEST, BIN, CRATE]
 ELSEWHERE = moved(CRATE, (-0.9, 0.5, 0.0))
@@ -485,8 +485,8 @@ def test_a_frame_that_failed_fails_again_and_the_map_goes_on(tmp_path, monkeypat
     np.testing.assert_array_equal(again._map.votes.weight, mapper._map.votes.weight)
 
 
-def test_points_that_came_are_labelled_by_their_own_neighbours(monkeypatch):
-    """As many came as were not seen: the neighbourhood of the map that was gone on with is not that of these."""
+def test_points_that_came_are_labelled_by_their_own_neighbors(monkeypatch):
+    """As many came as were not seen: the neighborhood of the map that was gone on with is not that of these."""
     base, _ = mapped(frames(THINGS)[:6])
     mapper, _ = mapped(frames(THINGS)[:1], base.snapshot())
     known = mapper._map
@@ -501,7 +501,7 @@ def test_points_that_came_are_labelled_by_their_own_neighbours(monkeypatch):
     mapper._label(known)
     ((_, rows, around, settings),) = given
     assert len(rows) == len(mapper._rows) > lacking > 0
-    np.testing.assert_array_equal(around.index, neighbourhood(known.points.xyz[rows], settings.geometry).index)
+    np.testing.assert_array_equal(around.index, neighborhood(known.points.xyz[rows], settings.geometry).index)
 
 
 def test_a_queue_never_blocks_and_says_what_it_drops():

@@ -27,13 +27,13 @@ from og_pointcloud.fitting.membership import (
     without_see_through,
 )
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
-from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SETTINGS = MembershipSettings()
 STUBBORN = replace(SETTINGS, own_vote=16.0)
-"""Of random votes neighbours would leave little but background."""
+"""Of random votes neighbors would leave little but background."""
 N = 100
 OBJECT = range(50)
 
@@ -55,7 +55,7 @@ def decide(
     settings: MembershipSettings = SETTINGS,
 ) -> Membership:
     xyz = on_a_line(table.weights.shape[1]) if xyz is None else xyz
-    around = neighbourhood(xyz, GeometrySettings())
+    around = neighborhood(xyz, GeometrySettings())
     result = assign_points(table, view_votes(table), groups(numbers), around, settings)
     assert result.instance_ids.dtype == np.int32
     assert result.share.dtype == result.detection_rate.dtype == np.float32
@@ -117,7 +117,7 @@ def test_growth_does_not_jump_over_a_gap() -> None:
     assert ids.tolist() == [0] * 40 + [BACKGROUND] * 3
 
 
-def test_points_that_no_view_sees_copy_their_neighbours_within_reach() -> None:
+def test_points_that_no_view_sees_copy_their_neighbors_within_reach() -> None:
     xyz = np.concatenate([on_a_line(50), [[50, 0, 0], [51.5, 0, 0], [70, 0, 0]]]).astype(np.float32)
     table = hand_table(53, [[(range(40), ONE)]] * 3, [range(50, 53)] * 3)
     ids = decide(table, [0] * 3, xyz).instance_ids
@@ -190,7 +190,7 @@ def dimly(shown: float, views: list[HandView]) -> list[int]:
 
 
 @pytest.mark.parametrize(("shown", "lost"), [(0.71, 0), (0.69, 0), (0.28, 1), (0.14, 3), (0.014, 4)])
-def test_what_no_view_sees_openly_is_as_its_neighbours_are(shown: float, lost: int) -> None:
+def test_what_no_view_sees_openly_is_as_its_neighbors_are(shown: float, lost: int) -> None:
     """Twenty points that every view's mask holds, beside background: the floor under a car, seen through its roof. Of
     those not seen openly the outermost are as the background that they adjoin, of the four that do the more the less
     they are seen; nothing better is known of the rest."""
@@ -228,11 +228,11 @@ def test_order_of_points_does_not_matter() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -> None:
+def test_certainty_is_what_views_say_times_how_far_neighbors_agree(seed: int) -> None:
     random = np.random.default_rng(seed)
     table, numbers = random_case(random)
     xyz = random.uniform(0, 8, (200, 3)).astype(np.float32)
-    around, votes = neighbourhood(xyz, GeometrySettings()), view_votes(table)
+    around, votes = neighborhood(xyz, GeometrySettings()), view_votes(table)
     result = assign_points(table, votes, groups(numbers), around, replace(STUBBORN, rate_share=0.0))
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     of_view, said = votes_of_views(in_mask, np.array(numbers), table.mask_view), []
@@ -521,7 +521,7 @@ def test_a_piece_apart_stays_by_the_majority_of_its_votes(votes: float, stays: b
     grid = np.stack([*np.meshgrid(np.arange(12.0), np.arange(12.0)), np.zeros((12, 12))], axis=-1).reshape(-1, 3)
     xyz = np.concatenate([grid, grid[:40] + np.array([100.0, 0, 0])]).astype(np.float32)
     apart = np.arange(len(xyz)) >= len(grid)
-    share, around = np.where(apart, votes, 0.9), neighbourhood(xyz, GeometrySettings())
+    share, around = np.where(apart, votes, 0.9), neighborhood(xyz, GeometrySettings())
     kept = _without_islands(np.zeros(len(xyz), np.int32), share, np.ones(len(xyz)), around, least=0.1)
     assert (kept[~apart] == 0).all()
     assert (kept[apart] == (0 if stays else UNOBSERVED)).all()

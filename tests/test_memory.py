@@ -43,7 +43,7 @@ from og_pointcloud.fitting.memory import (
 )
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint, kept_files
-from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
@@ -445,7 +445,7 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
     one = np.ones(8, np.float32)
     masks = [[(range(30), one), (range(30, 70), one)], [(range(10, 45), one)], [(range(20), one)], []]
     table = hand_table(100, masks)
-    around = neighbourhood(on_a_line(100), GeometrySettings())
+    around = neighborhood(on_a_line(100), GeometrySettings())
     exposure = random_array((4, 100), density=0.9, rng=np.random.default_rng(0), format="csr", dtype=np.float32)
     exposure.data += np.float32(0.01)
     table = replace(table, exposure=csr_array(table.exposure.maximum(exposure)))

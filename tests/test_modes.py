@@ -65,7 +65,7 @@ def test_paper_mode_draws_points_as_full_as_trained_gaussians() -> None:
     """Each rendered alone must cover its pixels; Gaussians of a file stay as they are."""
     scene = boxes_on_a_table().scene
     full = prepare(scene, FitSettings(mode="paper")).surface
-    np.testing.assert_allclose(full.gaussians.scale, np.repeat(0.7 * full.neighbourhood.spacing[:, None], 3, axis=1))
+    np.testing.assert_allclose(full.gaussians.scale, np.repeat(0.7 * full.neighborhood.spacing[:, None], 3, axis=1))
     np.testing.assert_allclose(full.gaussians.opacity, 0.95)
     drawn = full.gaussians.take(full.row_of_point)
     own = {"scale": drawn.scale * 2, "rotation": drawn.rotation, "opacity": drawn.opacity / 2}

@@ -14,7 +14,7 @@ from og_pointcloud.evaluate.baselines import center_sampling
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.photographs import Photographs
-from og_pointcloud.rendering.geometry import isotropic, neighbourhood
+from og_pointcloud.rendering.geometry import isotropic, neighborhood
 from og_pointcloud.scene import CutMasks, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -54,7 +54,7 @@ def halves(view: View) -> list[View]:
 
 def as_gaussians(scene: Scene) -> Scene:
     xyz = scene.points.xyz
-    splats = isotropic(scene.points, neighbourhood(xyz, GeometrySettings()).spacing, 0.7, 0.9)
+    splats = isotropic(scene.points, neighborhood(xyz, GeometrySettings()).spacing, 0.7, 0.9)
     points = Points(xyz, scene.points.origin, None, splats.scale, splats.rotation, splats.opacity)
     return replace(scene, points=points)
 

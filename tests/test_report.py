@@ -73,8 +73,8 @@ def test_one_value_of_every_knob_is_its_default_and_no_setting_is_tried_twice():
 
 def test_only_the_knobs_asked_for_are_tried():
     assert [setting.every for setting in settings_of(("views",))] == [1, 2, 4, 8]
-    assert [setting.name for setting in settings_of(("mode", "neighbours", "mode"))] == [
-        "default", "mode: fast", "neighbours: 12", "neighbours: 48",
+    assert [setting.name for setting in settings_of(("mode", "neighbors", "mode"))] == [
+        "default", "mode: fast", "neighbors: 12", "neighbors: 48",
     ]  # fmt: skip
     assert [setting.value for setting in settings_of(("grouping sample",))] == ["", "5,000", "20,000", "all"]
     with pytest.raises(OgPointcloudError, match="'color' is no knob; expected one of views, mode"):

@@ -13,7 +13,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.capture import read_geometry, read_poses
 from og_pointcloud.formats.poses import upright_axes
-from og_pointcloud.formats.structure_from_motion import ALL_PAIRS, NEIGHBOURS, _pairs, find_poses
+from og_pointcloud.formats.structure_from_motion import ALL_PAIRS, NEIGHBORS, _pairs, find_poses
 
 SIZE = 320, 240
 VIEWS = 9
@@ -138,9 +138,9 @@ def test_pairs(count):
     pairs = _pairs(count)
     assert len(set(pairs)) == len(pairs)
     assert all(0 <= a < b < count for a, b in pairs)
-    near = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + NEIGHBOURS, count))}
+    near = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + NEIGHBORS, count))}
     assert near <= set(pairs)
-    assert len(pairs) <= ALL_PAIRS**2 / 2 + count * NEIGHBOURS
+    assert len(pairs) <= ALL_PAIRS**2 / 2 + count * NEIGHBORS
     if count <= ALL_PAIRS:
         assert len(pairs) == count * (count - 1) // 2
     assert any(b - a > count // 2 for a, b in pairs), "the ends are compared too: loops close"

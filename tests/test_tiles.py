@@ -158,7 +158,7 @@ def test_the_order_of_points_does_not_matter():
     points = made.scene.points
     shuffled = replace(made.scene, points=Points(points.xyz[order], points.origin, points.rgb[order]))
     cloud = fit(shuffled, replace(SETTINGS, tile_points=POINTS // 4), progress=False)
-    # A state that no view saw is its nearest neighbour's: of two equally near ones, the first's.
+    # A state that no view saw is its nearest neighbor's: of two equally near ones, the first's.
     assert agreement(tiled(POINTS // 4).instance_ids[order], cloud.instance_ids) > 0.998
 
 

@@ -14,6 +14,7 @@ from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, insta
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.mapping import changes as changes_module
 from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import joined
@@ -210,6 +211,15 @@ def test_the_same_place_again_has_not_changed(monday):
     again = og.fit(scene(BEFORE, seed=2), progress=False)
     changes = og.compare(monday, again)
     assert (changes.gone, changes.new, changes.moved) == ((), (), ())
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_a_comparison_tells_how_many_views_it_goes_through(monday, friday, monkeypatch, progress):
+    bars = []
+    monkeypatch.setattr(changes_module, "with_bar", lambda views, *bar: bars.append(bar) or views)
+    og.compare(monday, friday, progress=progress)
+    assert bars == [("then", len(monday.cameras), progress), ("now", len(friday.cameras), progress)]
+    assert bars[0][1] > 1
 
 
 def test_time_reversed_swaps_gone_and_new(monday, friday):

@@ -246,7 +246,7 @@ def test_every_number_of_the_default_way_has_a_source_and_no_source_is_of_none()
 def test_half_and_twice_stay_possible_values():
     values = {one.path: one.values for one in numbers.constants()}
     assert values["membership.sure_share"] == (0.3, 0.8)  # 0.6: half of the way from there to 1
-    assert values["geometry.neighbours"] == (12, 48)
+    assert values["geometry.neighbors"] == (12, 48)
     assert values["geometry.reach"] == (1.5, 6.0)
 
 

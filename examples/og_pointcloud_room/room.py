@@ -57,7 +57,7 @@ def furnish(seed: int = 0) -> Room:
 def _against_wall(
     rng: Random, group: Group, wall: int, at_walls: list[Group], size: tuple[float, float, float]
 ) -> list[Item]:
-    """The group with its back to wall 0 (+y), 1 (-x), 2 (-y) or 3 (+x), clear of the neighbouring walls' groups."""
+    """The group with its back to wall 0 (+y), 1 (-x), 2 (-y) or 3 (+x), clear of the neighboring walls' groups."""
     length, reach = (size[0], size[1]) if wall % 2 == 0 else (size[1], size[0])
     right, left = (max(at_walls[(wall + step) % 4].depth, CORNER) + 0.03 for step in (3, 1))
     along = rng.uniform(-length / 2 + left + group.width / 2, length / 2 - right - group.width / 2)

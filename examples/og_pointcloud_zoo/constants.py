@@ -66,7 +66,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "geometry.enough_views", "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
     ),
     "guessed": (
-        "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
+        "geometry.opacity", "geometry.sight_thickness", "geometry.neighbors", "geometry.reach",
         "grouping.witness_share", "grouping.left_out_voice",
         "membership.sure_share", "membership.sure_votes", "membership.open_share",
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",

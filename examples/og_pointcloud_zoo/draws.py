@@ -29,7 +29,7 @@ class Draw:
     between a camera and what it sees. hidden: share of what no view sees that is in the cloud all the same.
     all_masked: floor, walls and ceiling have masks and classes too; else they are known background.
     split, merge, miss, spurious, wrong_class, edge_px: how the proposer errs (`MaskNoise`). spans: so many things share
-    their mask with a neighbour in all views. taken: so many things are gone in the second half of the views. levels:
+    their mask with a neighbor in all views. taken: so many things are gone in the second half of the views. levels:
     each view comes three times, with masks of parts, of things, and of things with what stands on them. confused: mean
     share of a thing's masks that are named as something alike (`places.ALIKE`); of each thing from none to twice that.
     blurred: share of views whose masks are ragged and often missing, as of a camera that moves.

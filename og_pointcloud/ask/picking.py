@@ -32,7 +32,7 @@ NEAR = 1.0
 HALF_WIDTH = 0.7
 """Half the side of a point's square, in point spacings: few gaps, and edges hardly fatter than what they show."""
 PIXELS_PER_SPACING = 2.0
-"""Pixels drawn for a point spacing, at most: two show all that there is of neighbouring points."""
+"""Pixels drawn for a point spacing, at most: two show all that there is of neighboring points."""
 WIDEST = 8
 """Most pixels that a square has on each side of its middle: points much nearer than the others then leave gaps."""
 NO_POINT = NONE_WITHIN_REACH

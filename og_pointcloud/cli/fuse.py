@@ -25,6 +25,8 @@ def run(arguments: argparse.Namespace) -> None:
     unit, output = arguments.depth_unit, arguments.output or arguments.capture / "points.ply"
     if unit is not None and not 0 < unit < float("inf"):
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
+    if arguments.output is None and output.exists():
+        raise OgPointcloudError(f"'{output}' is there already, and stays; to fuse anew, name another file (-o)")
     check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
     from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER

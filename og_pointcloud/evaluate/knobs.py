@@ -29,7 +29,7 @@ class Setting:
 
 
 def changed(record: Any, path: str, value: Any) -> Any:
-    """A settings record in which one number, at any depth, is another: ``changed(settings, "geometry.neighbours", 8)``.
+    """A settings record in which one number, at any depth, is another: ``changed(settings, "geometry.neighbors", 8)``.
 
     TypeError or AttributeError for a path that names none.
     """
@@ -43,7 +43,7 @@ ALL = 1_000_000_000
 """More points than any cloud has."""
 NUMBERS: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "mode": ("mode", ("grouping", "fast")),
-    "neighbours": ("geometry.neighbours", (12, 24, 48)),
+    "neighbors": ("geometry.neighbors", (12, 24, 48)),
     "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL)),
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),
     "sure share": ("membership.sure_share", (0.4, 0.6, 0.8)),

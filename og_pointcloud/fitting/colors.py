@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.rendering.geometry import Neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood
 
 DIFFERENCES = 443
 """Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
@@ -27,7 +27,7 @@ MOST = 9.0
 
 
 def color_ratios(
-    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sureness: NDArray[np.float64], around: Neighbourhood
+    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sureness: NDArray[np.float64], around: Neighborhood
 ) -> NDArray[np.float32]:
     """(443,) float32: how many times likelier each difference of color is between adjoining points of one state than of
     two. It falls with the difference, from at most MOST to at least 1 / MOST; 1 throughout where colors say nothing.
@@ -63,10 +63,10 @@ def likelihood_ratios(one: NDArray[np.float64], other: NDArray[np.float64]) -> N
     return (chance / (1 - chance)).astype(np.float32)
 
 
-def neighbour_weights(
-    rgb: NDArray[np.uint8] | None, around: Neighbourhood, ratios: NDArray[np.float32]
+def neighbor_weights(
+    rgb: NDArray[np.uint8] | None, around: Neighborhood, ratios: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(n, k) float32: for each point and neighbour the ratio of their difference; 0 for those that do not adjoin."""
+    """(n, k) float32: for each point and neighbor the ratio of their difference; 0 for those that do not adjoin."""
     if rgb is None or (ratios == 1).all():
         return around.adjoining.astype(np.float32)
     return _weights(np.ascontiguousarray(rgb), around.index, around.adjoining, ratios)
@@ -82,25 +82,25 @@ def color_difference(a, b):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True)
-def _counted(rgb, ids, voice, neighbours, adjoining):  # noqa: ANN001, ANN202
+def _counted(rgb, ids, voice, neighbors, adjoining):  # noqa: ANN001, ANN202
     """(2, DIFFERENCES): pairs of adjoining points by their difference, of one state and of two, by both voices."""
     count = np.zeros((2, DIFFERENCES))
     for g in range(len(ids)):
         if voice[g] == 0:
             continue
         # Two points that are each other's neighbor count twice: shares are what is used, not numbers.
-        for k in range(neighbours.shape[1]):
-            other = neighbours[g, k]
+        for k in range(neighbors.shape[1]):
+            other = neighbors[g, k]
             if adjoining[g, k] and voice[other] > 0:
                 count[int(ids[g] != ids[other]), color_difference(rgb[g], rgb[other])] += voice[g] * voice[other]
     return count
 
 
 @njit(cache=True, parallel=True)
-def _weights(rgb, neighbours, adjoining, ratios):  # noqa: ANN001, ANN202
-    weights = np.zeros(neighbours.shape, np.float32)
-    for g in prange(len(neighbours)):
-        for k in range(neighbours.shape[1]):
+def _weights(rgb, neighbors, adjoining, ratios):  # noqa: ANN001, ANN202
+    weights = np.zeros(neighbors.shape, np.float32)
+    for g in prange(len(neighbors)):
+        for k in range(neighbors.shape[1]):
             if adjoining[g, k]:
-                weights[g, k] = ratios[color_difference(rgb[g], rgb[neighbours[g, k]])]
+                weights[g, k] = ratios[color_difference(rgb[g], rgb[neighbors[g, k]])]
     return weights

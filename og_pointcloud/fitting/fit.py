@@ -143,7 +143,7 @@ def fit_prepared(
 
 def labelled_cloud(prepared: Prepared, labelling: Labelling, settings: FitSettings, journal: Journal) -> LabelledCloud:
     """The scene's points with a labelling of the surface's."""
-    spacing = float(np.median(prepared.surface.neighbourhood.spacing))
+    spacing = float(np.median(prepared.surface.neighborhood.spacing))
     # Points at the same place were left out of the surface, and get the same label.
     labelling = labelling.of_points(prepared.surface.row_of_point)
     return _cloud_of(prepared.scene, labelling, spacing, settings, journal)
@@ -180,7 +180,7 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
     if not surface.by_sight:
         return surface
     points = surface.scene.points
-    spacing = drawn_spacing(points.xyz, surface.neighbourhood)
+    spacing = drawn_spacing(points.xyz, surface.neighborhood)
     with journal.stage("point size"):
         choice = choose_scale(points, spacing, surface.thickness, surface.scene.views, surface.near, settings, journal)
         note_scale(choice, journal)

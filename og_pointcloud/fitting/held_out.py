@@ -23,7 +23,7 @@ from og_pointcloud.fitting.membership import SceneVotes, assign_points, views_wi
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
+from og_pointcloud.rendering.geometry import Neighborhood, isotropic, neighborhood, sample_of_points
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
@@ -75,9 +75,9 @@ def choose_scale(
     size = sum(4 * view.camera.width * view.camera.height for view in chosen)
     if size < MAPS_SHARE * memory_left(settings.memory):
         chosen = [replace(view, masks=view.mask_map()) for view in chosen]
-    # Neighbours are looked up within the sample, as the labels below are of the sample alone.
+    # Neighbors are looked up within the sample, as the labels below are of the sample alone.
     sample = sample_of_points(points.xyz, geometry.held_out_points)
-    around = neighbourhood(points.xyz[sample], geometry)
+    around = neighborhood(points.xyz[sample], geometry)
     asked = np.zeros(len(points), np.bool_)
     asked[sample] = True
     halves = chosen[0::2], chosen[1::2]
@@ -143,10 +143,10 @@ def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
     return float(np.average(best, weights=area))
 
 
-def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
+def _labels(table: MaskTable, around: Neighborhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
-    By votes alone, not by neighbours: what these mend is the same for all sizes, and a judge that saw hidden points by
+    By votes alone, not by neighbors: what these mend is the same for all sizes, and a judge that saw hidden points by
     hearsay would hold it against labels that do not. Nor does it doubt what few views show, or judge how complete masks
     are: half of the views judge.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from og_pointcloud.kernels import njit
 
 WINDOW = 24
-"""About how many points are looked at around one: as many as `GeometrySettings.neighbours`."""
+"""About how many points are looked at around one: as many as `GeometrySettings.neighbors`."""
 STRAIGHT_EDGE = 2 / np.pi
 """Length of the mean of unit directions that are spread evenly over one side of a straight line."""
 

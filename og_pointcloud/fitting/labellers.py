@@ -214,7 +214,7 @@ def _decided_by_views(
     """
     with journal.stage("membership"):
         rgb = surface.scene.points.rgb
-        membership = assign_points(table, votes, groups, surface.neighbourhood, settings.membership, rgb)
+        membership = assign_points(table, votes, groups, surface.neighborhood, settings.membership, rgb)
     if membership.dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
     with journal.stage("association"):

@@ -29,7 +29,7 @@ Nor is a point sure of an instance that hardly any of its votes are for, though 
 speaks against it: one ray that slips through would decide.
 
 Where no view sees a point openly, all votes on it are hearsay: rays that slip through a surface agree about what lies
-behind it, and are wrong. Such a point is as its neighbours are, if views know these better, unless it is seen nearly as
+behind it, and are wrong. Such a point is as its neighbors are, if views know these better, unless it is seen nearly as
 openly as others. What counts as openly is measured by the scene's other points: in surfaces of several noisy layers
 little is seen anywhere.
 """
@@ -48,21 +48,21 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
+from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.holes import seen_through_holes
 from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.geometry import Neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood
 from og_pointcloud.rendering.splatting import Gaussians, seen_from
 from og_pointcloud.settings import MembershipSettings
 
 ENTRIES_AT_ONCE = 1 << 26
 """Entries of the votes that are sorted by point at once: half a gigabyte."""
 ROUNDS = 2
-"""Times that points hear their neighbours: what one round settles, the next hears. Further ones change little."""
+"""Times that points hear their neighbors: what one round settles, the next hears. Further ones change little."""
 VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
 """A vote on a point, and the mask or view whose it is: written and read together, they share a line of memory."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
@@ -82,7 +82,7 @@ class SceneVotes:
 @dataclass(frozen=True)
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
-    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the
+    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbors bear out the
     state that a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the
     part of a group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that
     the scene's views contradict as a whole. scene: what all votes said."""
@@ -99,7 +99,7 @@ def assign_points(
     table: MaskTable,
     votes: ViewVotes,
     groups: MaskGroups,
-    around: Neighbourhood,
+    around: Neighborhood,
     settings: MembershipSettings,
     rgb: NDArray[np.uint8] | None = None,
     scene: SceneVotes | None = None,
@@ -128,22 +128,22 @@ def assign_points(
     least_open = settings.open_share * scene.typical_openness
     hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
-    weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
+    weights = neighbor_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
     possible = (group >= 0) & (share > settings.possible_share) & (support.share_openly > settings.possible_openly)
     ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
-    # Of what is known by hearsay alone, neighbours that are known better are asked; it is believed against so many of
+    # Of what is known by hearsay alone, neighbors that are known better are asked; it is believed against so many of
     # them as the point is seen openly.
     ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
     hearsay &= ids == BACKGROUND
     ids[hearsay], own_vote = group[hearsay], np.full(len(ids), np.inf)
     own_vote[hearsay] = (share * votes.openness)[hearsay] / least_open * weights[hearsay].sum(axis=1)
-    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, own_vote, 1.0)
-    # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
+    ids = _with_neighbors(ids, 1.0 - hearsay, around.index, weights, own_vote, 1.0)
+    # What is seen through an instance is no part of it; what no view saw is as its neighbors are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(ids, around)
     for _ in range(ROUNDS):
         own_vote = np.where(ids == BACKGROUND, settings.crossing, 1.0) * settings.own_vote
-        ids = _with_neighbours(ids, support.of_state(ids), around.index, weights, own_vote, 1 / settings.crossing)
+        ids = _with_neighbors(ids, support.of_state(ids), around.index, weights, own_vote, 1 / settings.crossing)
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32),
@@ -528,7 +528,7 @@ def _contradicted(
 
 
 @njit(cache=True)
-def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN202
+def _grow(ids, best, possible, neighbors, weights, votes):  # noqa: ANN001, ANN202
     """Hysteresis: possible points join their best group while a share ``votes`` of the adjoining points, by weight, is
     in it.
 
@@ -541,9 +541,9 @@ def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN
         for i in range(len(waiting)):
             g = waiting[i]
             joined, total = 0.0, 0.0
-            for k in range(neighbours.shape[1]):
+            for k in range(neighbors.shape[1]):
                 total += weights[g, k]
-                if ids[neighbours[g, k]] == best[g]:
+                if ids[neighbors[g, k]] == best[g]:
                     joined += weights[g, k]
             joins[i] = joined > 0 and joined >= votes * total
         if not joins.any():
@@ -556,14 +556,14 @@ def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN
 
 
 @njit(cache=True, parallel=True)
-def _with_neighbours(ids, voice, neighbours, weights, own_vote, of_background):  # noqa: ANN001, ANN202
+def _with_neighbors(ids, voice, neighbors, weights, own_vote, of_background):  # noqa: ANN001, ANN202
     """Every point takes the state that most of its adjoining points are in, by their weight and their ``voice``.
 
     The point's own state has ``own_vote`` votes; to a point of an instance background's votes count ``of_background``.
     All votes are on the states before (ties: the point's own, then the nearest's).
     """
     settled = ids.copy()
-    width = neighbours.shape[1]
+    width = neighbors.shape[1]
     for g in prange(len(ids)):
         if ids[g] < BACKGROUND or own_vote[g] == np.inf:
             continue
@@ -572,7 +572,7 @@ def _with_neighbours(ids, voice, neighbours, weights, own_vote, of_background): 
         votes = np.empty(width + 1)
         states[0], votes[0], count = ids[g], own_vote[g], 1
         for k in range(width):
-            other = neighbours[g, k]
+            other = neighbors[g, k]
             state = ids[other]
             if weights[g, k] == 0 or state < BACKGROUND:
                 continue
@@ -589,15 +589,15 @@ def _with_neighbours(ids, voice, neighbours, weights, own_vote, of_background): 
 
 
 @njit(cache=True, parallel=True)
-def _agreeing(ids, neighbours, adjoining):  # noqa: ANN001, ANN202
+def _agreeing(ids, neighbors, adjoining):  # noqa: ANN001, ANN202
     """(n,) float64: the part of each point's adjoining points that have its state; 1 where none adjoins."""
     agreeing = np.ones(len(ids))
     for g in prange(len(ids)):
         same, count = 0, 0
-        for k in range(neighbours.shape[1]):
+        for k in range(neighbors.shape[1]):
             if adjoining[g, k]:
                 count += 1
-                same += ids[neighbours[g, k]] == ids[g]
+                same += ids[neighbors[g, k]] == ids[g]
         if count:
             agreeing[g] = same / count
     return agreeing
@@ -624,7 +624,7 @@ def _without_islands(
     ids: NDArray[np.int32],
     share: NDArray[np.float64],
     area: NDArray[np.float64],
-    neighbourhood: Neighbourhood,
+    neighborhood: Neighborhood,
     least: float,
 ) -> NDArray[np.int32]:
     """Take from each instance the connected pieces beside its main one that are not of it by a majority of votes, or
@@ -636,9 +636,9 @@ def _without_islands(
     """
     # Pieces: connected components of adjoining points of one instance. density: what masks show of a point, on average.
     n = len(ids)
-    source = np.repeat(np.arange(n), neighbourhood.index.shape[1])
-    target = neighbourhood.index.ravel()
-    linked = neighbourhood.adjoining.ravel() & (ids[source] >= 0) & (ids[source] == ids[target])
+    source = np.repeat(np.arange(n), neighborhood.index.shape[1])
+    target = neighborhood.index.ravel()
+    linked = neighborhood.adjoining.ravel() & (ids[source] >= 0) & (ids[source] == ids[target])
     links = csr_array((np.ones(linked.sum(), bool), (source[linked], target[linked])), shape=(n, n))
     pieces, piece = connected_components(links, directed=False)
     labelled = np.flatnonzero(ids >= 0)
@@ -655,13 +655,13 @@ def _without_islands(
     return kept
 
 
-def _fill_unobserved(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.int32]:
+def _fill_unobserved(ids: NDArray[np.int32], neighborhood: Neighborhood) -> NDArray[np.int32]:
     """Points that no view saw copy the state of their nearest adjoining observed point; the rest stay unobserved."""
-    if neighbourhood.index.shape[1] == 0:
-        return ids  # one point has no neighbours
+    if neighborhood.index.shape[1] == 0:
+        return ids  # one point has no neighbors
     hidden = np.flatnonzero(ids == UNOBSERVED)
-    near = ids[neighbourhood.index[hidden]]
-    usable = neighbourhood.adjoining[hidden] & (near != UNOBSERVED)
+    near = ids[neighborhood.index[hidden]]
+    usable = neighborhood.adjoining[hidden] & (near != UNOBSERVED)
     first = np.argmax(usable, axis=1)
     filled = ids.copy()
     filled[hidden] = np.where(usable.any(axis=1), near[np.arange(len(hidden)), first], UNOBSERVED)

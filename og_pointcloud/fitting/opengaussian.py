@@ -31,7 +31,7 @@ from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, left_out_entry
-from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.settings import GeometrySettings
 
 MIN_OPACITY = 0.1
@@ -91,7 +91,7 @@ def read_opengaussian(
     # Leaves with a Gaussian that is kept become instances 0, 1, ...; k1 k2 leaves are mostly empty.
     used, ids = np.unique(leaves.of_gaussian[kept], return_inverse=True)
     settings, width = GeometrySettings(), leaves.unit_features.shape[1]
-    spacing = float(np.median(neighbourhood(xyz, settings).spacing))
+    spacing = float(np.median(neighborhood(xyz, settings).spacing))
     return LabelledCloud(
         xyz=xyz,
         origin=points.origin,

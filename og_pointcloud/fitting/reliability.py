@@ -30,7 +30,7 @@ from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.labellers import Labelling, grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
+from og_pointcloud.rendering.geometry import neighborhood, sample_of_points
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
@@ -212,7 +212,7 @@ def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings)
     return replace(
         surface,
         scene=replace(surface.scene, points=surface.scene.points.take(rows)),
-        neighbourhood=neighbourhood(surface.gaussians.xyz[rows], settings.geometry),
+        neighborhood=neighborhood(surface.gaussians.xyz[rows], settings.geometry),
         gaussians=surface.gaussians.take(rows),
         thickness=surface.thickness[rows],
     )

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -109,7 +109,7 @@ class TiledCloud:
 
     @cached_property
     def spacing(self) -> NDArray[np.float32]:
-        """(n,) float32, as `Neighbourhood.spacing`."""
+        """(n,) float32, as `Neighborhood.spacing`."""
         return self.work.array("spacing", self.key, vanished)[0]
 
     @cached_property
@@ -123,14 +123,14 @@ class TiledCloud:
         first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
         return slice(int(first), int(last))
 
-    def neighbours(self, tile: int, settings: GeometrySettings) -> Neighbourhood:
-        """The neighbourhood of a tile's members, numbered as these; it stays in the work folder."""
+    def neighbors(self, tile: int, settings: GeometrySettings) -> Neighborhood:
+        """The neighborhood of a tile's members, numbered as these; it stays in the work folder."""
 
         def find() -> tuple[NDArray[np.generic], ...]:
-            around = neighbourhood(self.points.xyz[self.members[tile]], settings)
+            around = neighborhood(self.points.xyz[self.members[tile]], settings)
             return around.spacing, around.index, around.adjoining
 
-        return Neighbourhood(*map(np.array, self.work.arrays(f"neighbours-{tile:04d}", self.key, find)))
+        return Neighborhood(*map(np.array, self.work.arrays(f"neighbors-{tile:04d}", self.key, find)))
 
 
 @lru_cache(maxsize=1)
@@ -149,7 +149,7 @@ def vanished() -> NoReturn:
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
     """The spacing that 95 % of the points do not exceed, by a sample of them."""
-    # Built fast rather than asked fast: few points are looked up. The first neighbour is the point itself.
+    # Built fast rather than asked fast: few points are looked up. The first neighbor is the point itself.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(xyz[:: 1 + len(xyz) // PROBES], k=[2, 3, 4])
     known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points

@@ -50,7 +50,7 @@ from og_pointcloud.rendering.geometry import (
     drawn_spacing,
     isotropic,
     near_plane,
-    neighbourhood,
+    neighborhood,
     sample_of_points,
 )
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
@@ -105,7 +105,7 @@ def fit_tiles(
     """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud. Returns the
     labelling of all its points, and their typical spacing.
 
-    work: keeps the points, their neighbours and what the views show (110 bytes a point, and about 37 for each view that
+    work: keeps the points, their neighbors and what the views show (110 bytes a point, and about 37 for each view that
     sees it). executor: takes tiles and views as tasks, and its workers read what they need, and write what is large, in
     the work folder; None: one after another, here.
     Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
@@ -169,7 +169,7 @@ def _points_per_tile(points: int, left: int) -> int:
 
 def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
     """(2, points of the tile) their spacing, and the one that they are drawn by."""
-    around, members = cloud.neighbours(tile, settings.geometry), cloud.members[tile]
+    around, members = cloud.neighbors(tile, settings.geometry), cloud.members[tile]
     return np.stack([around.spacing, drawn_spacing(cloud.points.xyz[members], around)])[:, cloud.inner(tile)]
 
 
@@ -199,7 +199,7 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
     if len(points) > CHOICE_POINTS:
         journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
         few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
-        around = neighbourhood(few.xyz, geometry)
+        around = neighborhood(few.xyz, geometry)
         spacing, drawn = around.spacing, drawn_spacing(few.xyz, around)
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
     choice = choose_scale(few, drawn, thickness, views, near, settings, journal)
@@ -402,7 +402,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     groups = group_masks(table, settings.grouping)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
-    around = neighbourhood(cloud.points.xyz[sample], settings.geometry)
+    around = neighborhood(cloud.points.xyz[sample], settings.geometry)
     judged = assign_points(table, votes, groups, around, settings.membership)
     # Groups of which the sample shows no sure point have rate 0: of these the tiles know more.
     dismissed = judged.dismissed & (judged.detection_rate > 0)
@@ -428,7 +428,7 @@ class _Decided:
 def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSettings, tile: int) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile])
-    around = cloud.neighbours(tile, settings.geometry)
+    around = cloud.neighbors(tile, settings.geometry)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0, missed_chance=0.0)
     votes, looks = view_votes(table), grouped.looks

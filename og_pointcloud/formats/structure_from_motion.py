@@ -34,7 +34,7 @@ LEAST_SHARE = 0.5
 """Share of the photographs that must find their place: fewer are a fragment of the scene."""
 ALL_PAIRS = 120
 """Up to so many photographs all pairs are compared; of more, only pairs among every k-th, at most so many of them."""
-NEIGHBOURS = 10
+NEIGHBORS = 10
 """Each photograph is in any case compared with so many before and after it."""
 CHUNK = 64
 """Pairs that COLMAP matches in one call: Ctrl-C and the progress bar wait for its end."""
@@ -185,7 +185,7 @@ def _pairs(count: int) -> list[tuple[int, int]]:
         (first, second)
         for first in range(count)
         for second in range(first + 1, count)
-        if second - first <= NEIGHBOURS or not (first % step or second % step)
+        if second - first <= NEIGHBORS or not (first % step or second % step)
     ]
 
 

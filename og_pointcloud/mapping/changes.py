@@ -28,6 +28,7 @@ from scipy.spatial import cKDTree
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
+from og_pointcloud.journal import with_bar
 from og_pointcloud.mapping.likeness import (
     ALIKE,
     FEWEST_SAME,
@@ -97,17 +98,19 @@ class Changes:
         return ", ".join(f"{len(items)} {name}" for items, name in counts)
 
 
-def compare(before: SceneLike, after: SceneLike) -> Changes:
+def compare(before: SceneLike, after: SceneLike, *, progress: bool = True) -> Changes:
     """What changed between two visits to one place, each a labelled cloud as `fit` or a mapper makes it.
 
     Both lie in one world frame. SceneError where they do not seem to, where the later one does not know its cameras
     (a file of an older version: fit it again), and FeatureSpaceError where their descriptors cannot be compared.
+    progress: show bars with the remaining time where stderr is a terminal.
 
     >>> print(og.compare(wall, wall))  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
     """
     earlier = as_scene(before).cloud
-    return compare_visits(Visit(earlier), Visit.in_frame_of(earlier, as_scene(after).cloud)).changes
+    later = Visit.in_frame_of(earlier, as_scene(after).cloud)
+    return compare_visits(Visit(earlier), later, progress=progress).changes
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,9 @@ class Comparison:
 
 
 def compare_visits(
-    earlier: Visit, later: Visit, again: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None
-) -> Comparison:
+    earlier: Visit, later: Visit, again: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
+    *, progress: bool = False,
+) -> Comparison:  # fmt: skip
     """What changed, with the evidence. Both visits lie in the local frame of the earlier one. Errors as `compare`.
 
     again: (n,) bool each, which of the earlier points the later visit measured again and which it saw through, if that
@@ -139,14 +143,17 @@ def compare_visits(
     scatter, spacing = max(earlier.surface.scatter, later.surface.scatter), max(a.spacing, b.spacing)
     tolerance = tolerance_of(spacing, scatter)
     # What the earlier views say of both visits' points.
-    shown, known = Presence.by(earlier.measured(), tolerance, a.xyz, b.xyz)
+    views = with_bar(earlier.measured(), "then", len(a.cameras), progress and earlier.depth is None)
+    shown, known = Presence.by(views, tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
-        (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
+        views = with_bar(earlier.measured(b.cameras), "then", len(b.cameras), progress)
+        (known,) = Presence.by(views, tolerance, b.xyz)
     shows = np.ones(len(b), bool)
     left_out = np.zeros(len(a))  # depth images leave nothing out
     # What the later views say of both; where frames were judged one by one, the map has counted it already.
     if again is None:
-        asked, own = Presence.by(later.measured(), tolerance, a.xyz, b.xyz)
+        views = with_bar(later.measured(), "now", len(b.cameras), progress and later.depth is None)
+        asked, own = Presence.by(views, tolerance, a.xyz, b.xyz)
         _require_one_frame(asked)
         again, shows = (asked.present, asked.absent), own.present
         if later.depth is None:

@@ -14,14 +14,14 @@ from og_pointcloud.journal import Journal
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points
 from og_pointcloud.mapping.kept_views import KeptView
-from og_pointcloud.rendering.geometry import Neighbourhood, drawn_spacing, isotropic, near_plane
+from og_pointcloud.rendering.geometry import Neighborhood, drawn_spacing, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 
 
-def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, settings: FitSettings) -> LabelledCloud:
-    """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighbourhood."""
+def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, settings: FitSettings) -> LabelledCloud:
+    """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighborhood."""
     # Where each of the map's rows stands among the points to label, -1 for those that are left out.
     place = np.full(known.points.n, -1, np.int32)
     place[rows] = np.arange(len(rows), dtype=np.int32)

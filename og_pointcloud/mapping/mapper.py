@@ -37,7 +37,7 @@ from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.scene import Points, require_finite
 from og_pointcloud.settings import FitSettings, fit_settings
 
@@ -105,7 +105,7 @@ class Mapper:
         self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
         self._base = None if start is None else as_scene(start).cloud
         self._map: GrowingMap | None = None
-        self._around: Neighbourhood | None = None  # of a known cloud
+        self._around: Neighborhood | None = None  # of a known cloud
         self._rows = np.zeros(0, np.int64)  # of its points, in their order
         self._labelled: tuple[int, LabelledScene] | None = None
         self._changes: Changes | None = None
@@ -121,7 +121,7 @@ class Mapper:
         if not len(points):
             raise SceneError("the map has 0 points; expected at least one: begin an empty one, without start and cloud")
         require_finite(points.xyz)
-        self._around = neighbourhood(points.xyz, self.settings.geometry)
+        self._around = neighborhood(points.xyz, self.settings.geometry)
         spacing = float(np.median(self._around.spacing)) if spacing is None else spacing
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
@@ -303,7 +303,7 @@ class Mapper:
         rows = np.concatenate([self._rows, np.arange(len(self._rows), known.points.n)])
         rows = rows[chosen[rows]]
         if around is None or not np.array_equal(rows, self._rows):  # as many may be others
-            around = neighbourhood(known.points.xyz[rows], self.settings.geometry)
+            around = neighborhood(known.points.xyz[rows], self.settings.geometry)
         visit = labelled(known, rows, around, self.settings)
         if self._base is not None:
             return self._folded(self._base, visit, known)

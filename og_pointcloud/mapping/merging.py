@@ -68,7 +68,7 @@ def update(
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
     visit = fit(capture, settings, progress=progress)
     earlier, later = Visit(cloud), Visit.in_frame_of(cloud, visit, depth)
-    return merge(earlier, later, compare_visits(earlier, later), capture.name)
+    return merge(earlier, later, compare_visits(earlier, later, progress=progress), capture.name)
 
 
 def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: float | None = None) -> Updated:

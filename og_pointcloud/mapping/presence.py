@@ -27,7 +27,7 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.likeness import Look, descriptors_of
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, DiscSurface, MeasuredView, states_of_points
 from og_pointcloud.mapping.voxels import Columns
-from og_pointcloud.rendering.geometry import Neighbourhood, nearest_in, neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood, nearest_in, neighborhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
@@ -47,7 +47,7 @@ TELLING = 1.5
 FLAT_SHARE = 0.25
 """Share of what is looked at that must be seen through where most of an object lies flat on something else."""
 ABOUT = 32
-"""Neighbours of each point seen through by which it is estimated how much the other cloud leaves out there."""
+"""Neighbors of each point seen through by which it is estimated how much the other cloud leaves out there."""
 CHANCE = 0.05
 """Probability below which it is no accident that a cloud lacks points: the usual level of a test."""
 
@@ -139,11 +139,11 @@ class Visit:
         return DiscSurface(self.cloud.xyz, self.around)
 
     @cached_property
-    def around(self) -> Neighbourhood:
-        """Neighbours of its points. SceneError where it has none."""
+    def around(self) -> Neighborhood:
+        """Neighbors of its points. SceneError where it has none."""
         if not len(self.cloud):
             raise SceneError("a visit has 0 points; expected at least one: it shows nothing to compare")
-        return neighbourhood(self.cloud.xyz, GeometrySettings())
+        return neighborhood(self.cloud.xyz, GeometrySettings())
 
     def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
         """What its views measured; or, with cameras, what views from there would measure of its cloud."""
@@ -158,11 +158,11 @@ class Visit:
 
     @cached_property
     def adjoining(self) -> csr_array:
-        """(instances, instances) bool: whether some points of the two are neighbours."""
+        """(instances, instances) bool: whether some points of the two are neighbors."""
         ids, count = self.cloud.instance_ids, len(self.cloud.instances)
         touching = csr_array((count, count), dtype=np.bool_)
-        for neighbour in self.around.index.T:
-            touching += _pairs(ids, ids[neighbour], (count, count)).astype(np.bool_)
+        for neighbor in self.around.index.T:
+            touching += _pairs(ids, ids[neighbor], (count, count)).astype(np.bool_)
         return (touching + touching.T).tocsr()
 
     def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
@@ -189,9 +189,9 @@ class Visit:
         their own instance."""
         ids, surface = self.cloud.instance_ids, self.surface
         tells = np.ones(len(ids), bool)
-        for neighbour in self.around.index.T:
-            off = np.abs(np.einsum("na,na->n", self.cloud.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
-            tells &= (ids[neighbour] == ids) | (off > TELLING * tolerance)
+        for neighbor in self.around.index.T:
+            off = np.abs(np.einsum("na,na->n", self.cloud.xyz - surface.xyz[neighbor], surface.normal[neighbor]))
+            tells &= (ids[neighbor] == ids) | (off > TELLING * tolerance)
         return tells
 
 

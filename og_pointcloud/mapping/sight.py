@@ -28,7 +28,7 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping.voxels import in_camera, turned
-from og_pointcloud.rendering.geometry import Neighbourhood, depths, neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood, depths, neighborhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
@@ -88,15 +88,15 @@ class MeasuredView:
 
 
 class DiscSurface:
-    """A cloud as a surface: each point a disc in the plane of its neighbours.
+    """A cloud as a surface: each point a disc in the plane of its neighbors.
 
-    xyz: (n, 3) float32, each moved onto the plane of its neighbours, but no farther than noise explains. spacing:
-    typical distance of neighbours. scatter: standard deviation of the points off their planes, before they were moved;
+    xyz: (n, 3) float32, each moved onto the plane of its neighbors, but no farther than noise explains. spacing:
+    typical distance of neighbors. scatter: standard deviation of the points off their planes, before they were moved;
     noise: of the planes themselves.
     """
 
-    def __init__(self, xyz: NDArray[np.float32], around: Neighbourhood | None = None) -> None:
-        around = neighbourhood(xyz, GeometrySettings()) if around is None else around
+    def __init__(self, xyz: NDArray[np.float32], around: Neighborhood | None = None) -> None:
+        around = neighborhood(xyz, GeometrySettings()) if around is None else around
         self.spacing = float(np.median(around.spacing))
         self.normal, height, off = _planes(xyz, around.index[:, :PLANE_POINTS])
         noise = self.scatter = float(np.median(off))
@@ -104,7 +104,7 @@ class DiscSurface:
         # part of the shape, and keeps the rest of its height.
         shift = np.clip(height, -MOST_SHIFT * noise, MOST_SHIFT * noise)
         self.xyz = (xyz - shift[:, None] * self.normal).astype(np.float32)
-        self.noise = noise * min(1.0, SMOOTHED / np.sqrt(1 + PLANE_POINTS))  # the point itself and its neighbours
+        self.noise = noise * min(1.0, SMOOTHED / np.sqrt(1 + PLANE_POINTS))  # the point itself and its neighbors
         self._radius = (DISC_SPACINGS * np.maximum(around.spacing, self.spacing)).astype(np.float32)
 
     def seen_from(self, camera: Camera) -> MeasuredView:
@@ -128,7 +128,7 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
     """What a depth image measures. depth: (h, w) float32, 0 unmeasured. A sparse one (a projected lidar scan, say) is
     shrunk until most of its pixels hold a reading, the nearest of those that fall into each."""
     measured = depth > 0
-    # Density where anything is measured, by right-hand neighbours: sky and black surfaces do not make an image sparse.
+    # Density where anything is measured, by right-hand neighbors: sky and black surfaces do not make an image sparse.
     share = float(measured[:, 1:][measured[:, :-1]].mean()) if measured[:, :-1].any() else 1.0
     # Blocks of step x step pixels hold two readings on average.
     step = int(np.ceil(np.sqrt(2 / max(share, 1e-3)))) if share < 0.5 else 1
@@ -163,22 +163,22 @@ def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredV
 
 
 def _planes(
-    xyz: NDArray[np.float32], neighbours: NDArray[np.int32]
+    xyz: NDArray[np.float32], neighbors: NDArray[np.int32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The plane fitted to each point and its neighbours (n, k): (n, 3) unit normals, (n,) the point's height over the
+    """The plane fitted to each point and its neighbors (n, k): (n, 3) unit normals, (n,) the point's height over the
     plane, and (n,) the standard deviation of all of them off it."""
     normal, height, off = (np.empty(shape, np.float32) for shape in ((len(xyz), 3), len(xyz), len(xyz)))
     for start in range(0, len(xyz), AT_ONCE):
         part = np.arange(start, min(start + AT_ONCE, len(xyz)))
-        for count in (neighbours.shape[1], neighbours.shape[1] // 2):
-            about = np.concatenate([xyz[part, None], xyz[neighbours[part, :count]]], axis=1).astype(np.float64)
+        for count in (neighbors.shape[1], neighbors.shape[1] // 2):
+            about = np.concatenate([xyz[part, None], xyz[neighbors[part, :count]]], axis=1).astype(np.float64)
             about -= about.mean(axis=1, keepdims=True)
             # Of the scatter matrix, the eigenvector of the smallest eigenvalue (the first: ascending) is the normal.
             # A plane has three parameters: count + 1 points leave count - 2 degrees of freedom.
             values, vectors = np.linalg.eigh(np.swapaxes(about, 1, 2) @ about / max(count - 2, 1))
             deviation = np.sqrt(np.maximum(values[:, 0], 0))
-            if count < neighbours.shape[1]:
-                # Near an edge the farther neighbours reach another surface; the nearer half fits much better there.
+            if count < neighbors.shape[1]:
+                # Near an edge the farther neighbors reach another surface; the nearer half fits much better there.
                 better = deviation < SAME_SHEET * off[part]
                 part, vectors, about, deviation = part[better], vectors[better], about[better], deviation[better]
             normal[part], off[part] = vectors[..., 0], deviation
@@ -260,7 +260,7 @@ def _normals(depth, lens):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _step(here, before, after):  # noqa: ANN001, ANN202
-    """Change of depth per pixel towards the measured neighbour that differs less; 0 where neither is measured."""
+    """Change of depth per pixel towards the measured neighbor that differs less; 0 where neither is measured."""
     if before <= 0 and after <= 0:
         return 0.0
     if before <= 0 or (after > 0 and abs(after - here) < abs(here - before)):
@@ -276,7 +276,7 @@ def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
     height, width = depth.shape
     x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     planes, own = np.empty((height, width, 5), np.float32), np.zeros(depth.shape)
-    # A point in a neighbouring pixel lies up to a pixel and a half off this one's middle along each axis: n . ray
+    # A point in a neighboring pixel lies up to a pixel and a half off this one's middle along each axis: n . ray
     # differs between the two by no more than this.
     turn = 1.5 * np.sqrt(1 / fx**2 + 1 / fy**2)
     for row in prange(height):

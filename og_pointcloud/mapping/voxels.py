@@ -1,7 +1,7 @@
 """Points of a growing map: one for each voxel of the map's spacing, in arrays that only grow, found by a voxel hash.
 
 A place that is measured again moves its point towards the mean of all readings. A point keeps its row for good, as
-votes and evidence refer to it. Rows are also filed by place, in packets of neighbours, so that a frame goes only
+votes and evidence refer to it. Rows are also filed by place, in packets of neighbors, so that a frame goes only
 through the packets before its camera.
 """
 
@@ -157,7 +157,7 @@ class VoxelPoints(Columns):
 
     def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> NDArray[np.int64]:
         """Add points that are kept as they are, several in a voxel if they are so dense. Returns (n,) their rows."""
-        # By bricks, so that neighbours have rows close to each other.
+        # By bricks, so that neighbors have rows close to each other.
         order = np.argsort(_keys(xyz, self.packets.side), kind="stable")
         self._reserve(len(xyz))
         rows = slice(self.n, self.n + len(xyz))
@@ -227,7 +227,7 @@ def _keys(xyz, edge):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True)
 def _slot(key, keys):  # noqa: ANN001, ANN202
     """Where a key is, or would be put: linear probing from its hash."""
-    # Times 2^64 over the golden ratio (Knuth, The Art of Computer Programming, 6.4), so that neighbouring voxels differ
+    # Times 2^64 over the golden ratio (Knuth, The Art of Computer Programming, 6.4), so that neighboring voxels differ
     # in the upper bits; the shift brings these down to the lower ones, which the mask keeps.
     mask = np.uint64(len(keys) - 1)
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)

@@ -1,4 +1,4 @@
-"""What a fit asks of points before anything is drawn: spacing, neighbours, samples, the pixels worth looking at.
+"""What a fit asks of points before anything is drawn: spacing, neighbors, samples, the pixels worth looking at.
 
 A plain cloud's points are drawn as isotropic Gaussians of a share of their own spacing; `fitting.held_out` chooses the
 share.
@@ -21,7 +21,7 @@ from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
 TAMED_BY = 16
-"""A point's spacing is at most the median spacing of this many neighbours."""
+"""A point's spacing is at most the median spacing of this many neighbors."""
 SPARSE = 3.0
 """A point whose spacing is more than so many times the scene's is a floater, if those about it are scattered."""
 SCATTERED = 0.1
@@ -30,7 +30,7 @@ alike. Of a surface it is less the sparser it is beside its noise."""
 FLOATER = 0.1
 """Floaters are drawn so many typical spacings apart: they hide next to nothing."""
 ROWS_AT_ONCE = 1 << 18
-"""Points whose neighbours are looked up at once: the look-up returns three times as many bytes as are kept."""
+"""Points whose neighbors are looked up at once: the look-up returns three times as many bytes as are kept."""
 
 CELLS = 1 << 13
 """Cells to half the cloud's width in which places are told apart: some to a spacing of 100 million points, and so much
@@ -44,7 +44,7 @@ CURVE_REACH = 4
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class Neighborhood:
     """spacing: (n,) float32, mean distance to the three nearest other places, tamed for floaters.
     index: (n, k) int32, nearest points, nearest first, without the point itself. adjoining: (n, k) bool, those within
     the settings' reach (in spacings)."""
@@ -66,22 +66,22 @@ def nearest_in(tree: cKDTree, xyz: NDArray[np.floating], k: int = 1) -> tuple[ND
     return np.asarray(distance), np.asarray(index)
 
 
-def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighbourhood:
-    """Spacing and neighbours of every point. xyz: (n, 3), any unit.
+def neighborhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighborhood:
+    """Spacing and neighbors of every point. xyz: (n, 3), any unit.
 
-    A floater's own spacing says nothing about a surface: it is held to the median spacing of its neighbours.
+    A floater's own spacing says nothing about a surface: it is held to the median spacing of its neighbors.
     Duplicates have the spacing of their place, as if it held one point. One point or place alone has spacing 1.
     """
-    index, distance = _nearest(xyz, settings.neighbours)
+    index, distance = _nearest(xyz, settings.neighbors)
     if distance[:, :1].all():
         spacing, typical = _spacing(index, distance)
     else:
         first, place = distinct_places(xyz)
-        of_places, typical = _spacing(*_nearest(xyz[first], settings.neighbours))
+        of_places, typical = _spacing(*_nearest(xyz[first], settings.neighbors))
         spacing = of_places[place]
     # Where points are denser than is typical, they adjoin as far as elsewhere.
     adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
-    return Neighbourhood(spacing, index, adjoining)
+    return Neighborhood(spacing, index, adjoining)
 
 
 def _nearest(xyz: NDArray[np.float32], most: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
@@ -112,7 +112,7 @@ def _spacing(index: NDArray[np.int32], distance: NDArray[np.float64]) -> tuple[N
     return tamed.astype(np.float32), float(np.median(spacing))
 
 
-def drawn_spacing(xyz: NDArray[np.float32], around: Neighbourhood) -> NDArray[np.float32]:
+def drawn_spacing(xyz: NDArray[np.float32], around: Neighborhood) -> NDArray[np.float32]:
     """(n,) float32, the spacing that points are drawn by: their own, and FLOATER of the typical one for floaters.
 
     Points that lie far apart in all directions close no surface. Drawn as large as they are apart, a few hundred of

@@ -517,7 +517,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
     weights = np.empty(first[-1], np.float32)
     counts = np.zeros(tiles, np.int64)
     sums = np.zeros((workers, id_count + 1))
-    # Each worker takes every workers-th tile (neighbouring tiles cost alike, so the shares are even) and adds up in
+    # Each worker takes every workers-th tile (neighboring tiles cost alike, so the shares are even) and adds up in
     # scratch rows of its own.
     for worker in prange(workers):
         sum_of, touched = sums[worker], np.empty(TILE * TILE, np.int32)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
-    Neighbourhood,
+    Neighborhood,
     along_curve,
     distinct_places,
     isotropic,
     near_plane,
-    neighbourhood,
+    neighborhood,
     thinned,
 )
 from og_pointcloud.rendering.splatting import Gaussians
@@ -33,7 +33,7 @@ class Surface:
     its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in their order.
-    neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
+    neighborhood: spacing and neighbors of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
     stride: every stride-th row and column of the images is used; 1 but in mode paper.
@@ -43,7 +43,7 @@ class Surface:
 
     scene: Scene
     row_of_point: NDArray[np.int64] | None
-    neighbourhood: Neighbourhood
+    neighborhood: Neighborhood
     gaussians: Gaussians
     near: float
     thickness: NDArray[np.float32]
@@ -70,7 +70,7 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         if not is_paper:  # which has a choice of its own: so many steps, a view each
             scene = with_needed_views(scene, settings.geometry.enough_views, journal)
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
-        around = neighbourhood(scene.points.xyz, settings.geometry)
+        around = neighborhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, settings, journal)
         spacing, typical = around.spacing, float(np.median(around.spacing))
@@ -113,7 +113,7 @@ def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> 
     return replace(scene, points=scene.points.take(order)), row if row_of_point is None else row[row_of_point]
 
 
-def _gaussians(scene: Scene, around: Neighbourhood, settings: FitSettings, journal: Journal) -> Gaussians:
+def _gaussians(scene: Scene, around: Neighborhood, settings: FitSettings, journal: Journal) -> Gaussians:
     """Round Gaussians, whose size `held_out` may change later; in mode paper the file's own, if it has some."""
     if scene.points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)

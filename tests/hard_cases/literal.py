@@ -53,10 +53,10 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
 
 
 def membership(
-    votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbours: list[list[int]],
+    votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbors: list[list[int]],
     settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None,
 ) -> tuple[Ids, Array, Array]:  # fmt: skip
-    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbours: of each point, nearest first;
+    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbors: of each point, nearest first;
     rgb: (n, 3)."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
@@ -127,11 +127,11 @@ def membership(
     alike = np.ones((len(points),) * 2)
     if rgb is not None:
         apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
-        alike = color_ratios(rgb, ids, sureness(), neighbours)[np.rint(apart).astype(int)]
+        alike = color_ratios(rgb, ids, sureness(), neighbors)[np.rint(apart).astype(int)]
     possible = (best >= 0) & (share > settings.possible_share) & (openly > settings.possible_openly)
     while True:  # a middling share counts where it adjoins points that are in already
-        beside = [sum(alike[g, other] for other in neighbours[g] if ids[other] == best[g]) for g in points]
-        needed = [settings.growth_votes * sum(alike[g, other] for other in neighbours[g]) for g in points]
+        beside = [sum(alike[g, other] for other in neighbors[g] if ids[other] == best[g]) for g in points]
+        needed = [settings.growth_votes * sum(alike[g, other] for other in neighbors[g]) for g in points]
         joins = [g for g in points if possible[g] and ids[g] < 0 and beside[g] and beside[g] >= needed[g]]
         if not joins:
             break
@@ -139,30 +139,30 @@ def membership(
     ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
     hearsay &= ids == BACKGROUND
     known = ids.copy()
-    for g in np.flatnonzero(hearsay):  # hearsay counts as its neighbours do, as far as the point is seen openly
-        weight = sum(alike[g, other] for other in neighbours[g])
+    for g in np.flatnonzero(hearsay):  # hearsay counts as its neighbors do, as far as the point is seen openly
+        weight = sum(alike[g, other] for other in neighbors[g])
         said = {int(best[g]): share[g] * votes.openness[g] / (settings.open_share * typical) * weight}
-        for other in neighbours[g]:
+        for other in neighbors[g]:
             if not hearsay[other] and known[other] != UNOBSERVED:
                 said[int(known[other])] = said.get(int(known[other]), 0.0) + alike[g, other]
         ids[g] = max(said, key=lambda state: said[state])
-    ids = _filled(_without_islands(ids, share, weights, group, neighbours, settings.island_share), neighbours)
+    ids = _filled(_without_islands(ids, share, weights, group, neighbors, settings.island_share), neighbors)
     for _ in range(2):
-        ids = _with_neighbours(ids, sureness(), neighbours, alike, settings)
-    agreeing = [np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0 for g in points]
+        ids = _with_neighbors(ids, sureness(), neighbors, alike, settings)
+    agreeing = [np.mean([ids[other] == ids[g] for other in neighbors[g]]) if neighbors[g] else 1.0 for g in points]
     return ids, share, sureness() * agreeing
 
 
-def _filled(ids: NDArray[np.int32], neighbours: list[list[int]]) -> NDArray[np.int32]:
-    """Unobserved points as the nearest neighbour that is not."""
+def _filled(ids: NDArray[np.int32], neighbors: list[list[int]]) -> NDArray[np.int32]:
+    """Unobserved points as the nearest neighbor that is not."""
     filled = ids.astype(np.int32)
     for g in np.flatnonzero(ids == UNOBSERVED):
-        filled[g] = next((ids[other] for other in neighbours[g] if ids[other] != UNOBSERVED), UNOBSERVED)
+        filled[g] = next((ids[other] for other in neighbors[g] if ids[other] != UNOBSERVED), UNOBSERVED)
     return filled
 
 
 def _without_islands(
-    ids: Ids, share: Array, weights: Array, group: Sequence[int], neighbours: list[list[int]], least: float
+    ids: Ids, share: Array, weights: Array, group: Sequence[int], neighbors: list[list[int]], least: float
 ) -> NDArray[np.int32]:
     """Pieces of an instance whose mean share is no majority, or whose points show less than ``least`` of what those of
     its main piece do, unobserved."""
@@ -172,7 +172,7 @@ def _without_islands(
         left, pieces = set(np.flatnonzero(ids == k).tolist()), []
         while left:
             piece = {min(left)}
-            while grown := {o for g in left for o in (g, *neighbours[g]) if _linked(g, o, piece, left, neighbours)}:
+            while grown := {o for g in left for o in (g, *neighbors[g]) if _linked(g, o, piece, left, neighbors)}:
                 piece |= grown
             pieces.append(sorted(piece))
             left -= piece
@@ -184,22 +184,22 @@ def _without_islands(
     return kept
 
 
-def _linked(g: int, other: int, piece: set[int], left: set[int], neighbours: list[list[int]]) -> bool:
+def _linked(g: int, other: int, piece: set[int], left: set[int], neighbors: list[list[int]]) -> bool:
     """Whether ``other`` is of the instance, not yet in the piece, and adjoins it in either direction."""
     if other not in left or other in piece:
         return False
-    return any(p in neighbours[other] or other in neighbours[p] for p in piece)
+    return any(p in neighbors[other] or other in neighbors[p] for p in piece)
 
 
-def _with_neighbours(
-    ids: Ids, sureness: Array, neighbours: list[list[int]], alike: Array, settings: MembershipSettings
+def _with_neighbors(
+    ids: Ids, sureness: Array, neighbors: list[list[int]], alike: Array, settings: MembershipSettings
 ) -> NDArray[np.int32]:
-    """One round: points take the state that their neighbours are in, by how sure these are."""
+    """One round: points take the state that their neighbors are in, by how sure these are."""
     after = ids.copy()
     for g in np.flatnonzero(ids != UNOBSERVED):
         own = settings.own_vote * (settings.crossing if ids[g] == BACKGROUND else 1)
         votes = {int(ids[g]): own}  # in order of nearness: ties are won by the first
-        for other in neighbours[g]:
+        for other in neighbors[g]:
             state = int(ids[other])
             if state != UNOBSERVED:
                 heard = 1 / settings.crossing if state == BACKGROUND and ids[g] >= 0 else 1
@@ -208,13 +208,13 @@ def _with_neighbours(
     return after
 
 
-def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbours: list[list[int]]) -> Array:
+def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbors: list[list[int]]) -> Array:
     """(443,) how many times likelier a difference of colors is within one state than between two, by Eq. of isotonic
     regression: of all intervals about a difference, the least of the greatest means."""
     count = np.zeros((2, 443))
     sure = np.rint(256 * sureness**4) / 256
     for g in np.flatnonzero(sure):
-        for other in neighbours[g]:
+        for other in neighbors[g]:
             apart = np.linalg.norm(rgb[g].astype(float) - rgb[other].astype(float))
             count[int(ids[g] != ids[other]), round(apart)] += sure[g] * sure[other]
     return likelihood_ratios(count)

@@ -17,7 +17,7 @@ from og_pointcloud.fitting.learned.matching import eq5_scores, match_masks, visi
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import Membership, assign_points
 from og_pointcloud.fitting.view_votes import view_votes
-from og_pointcloud.rendering.geometry import Neighbourhood
+from og_pointcloud.rendering.geometry import Neighborhood
 from og_pointcloud.settings import MatchingSettings, MembershipSettings
 
 POINTS, REACH = 80, 3
@@ -81,14 +81,14 @@ def certainty_of_any_votes(seed: float) -> Answer:
 
 @agrees(0, "seed", tuple(range(4)))
 def borders(seed: float) -> Answer:
-    """Points hear their neighbours by how sure these are, twice."""
+    """Points hear their neighbors by how sure these are, twice."""
     ours, (ids, *_) = _both(int(seed), MembershipSettings(own_vote=0.4))
     return Answer(ours.instance_ids, ids)
 
 
 @agrees(0, "seed", tuple(range(4)))
 def borders_by_color(seed: float) -> Answer:
-    """The same, each neighbour as far as its color speaks for one thing."""
+    """The same, each neighbor as far as its color speaks for one thing."""
     random = np.random.default_rng(int(seed))
     rgb = np.clip(3 * np.arange(POINTS)[:, None] + random.normal(0, 9, (POINTS, 3)), 0, 255).astype(np.uint8)
     ours, (ids, *_) = _both(int(seed), MembershipSettings(own_vote=0.4), rgb)
@@ -97,12 +97,12 @@ def borders_by_color(seed: float) -> Answer:
 
 @agrees(0)
 def border_tie() -> Answer:
-    """A point between two instances with equal votes keeps its own; one with a surer neighbour changes."""
+    """A point between two instances with equal votes keeps its own; one with a surer neighbor changes."""
     share = np.array([[0.9, 0.5, 0.1, 0.9, 0.5, 0.0], [0.1, 0.4, 0.9, 0.1, 0.4, 1.0]])
     table = _made(share, 1 - share.sum(axis=0, keepdims=True), np.ones((1, 6)), [0, 0])
-    neighbours = [[1], [0, 2], [1], [4], [3, 5, 5, 5], [4]]
+    neighbors = [[1], [0, 2], [1], [4], [3, 5, 5, 5], [4]]
     settings = MembershipSettings(sure_share=0.45, own_vote=0.6)
-    ids = _assigned(table, [0, 1], neighbours, settings).instance_ids
+    ids = _assigned(table, [0, 1], neighbors, settings).instance_ids
     return Answer(ids, int32([0, 0, 1, 0, 1, 1]))
 
 
@@ -111,8 +111,8 @@ def seen_by_no_view() -> Answer:
     """Points that no view sees take the state of the nearest that one does; without one, they stay unobserved."""
     inside = single([[1, 0, 0, 0, 0]])
     table = _made(inside, single([[0, 1, 0, 0, 0]]), single([[1, 1, 0, 0, 0]]), [0])
-    neighbours = [[1], [0], [0, 1], [1, 0], []]
-    return Answer(_assigned(table, [0], neighbours).instance_ids, int32([0, BACKGROUND, 0, BACKGROUND, UNOBSERVED]))
+    neighbors = [[1], [0], [0, 1], [1, 0], []]
+    return Answer(_assigned(table, [0], neighbors).instance_ids, int32([0, BACKGROUND, 0, BACKGROUND, UNOBSERVED]))
 
 
 @agrees(1e-6, "seed", (0, 1, 2))
@@ -189,15 +189,15 @@ def _lone(count: int) -> list[list[int]]:
 
 
 def _assigned(
-    table: MaskTable, group: list[int], neighbours: list[list[int]], settings: MembershipSettings | None = None,
+    table: MaskTable, group: list[int], neighbors: list[list[int]], settings: MembershipSettings | None = None,
     rgb: NDArray[np.uint8] | None = None,
 ) -> Membership:  # fmt: skip
-    """The library's answer; neighbours of each point, nearest first."""
-    width = max(1, *map(len, neighbours))
-    index, adjoining = np.zeros((len(neighbours), width), np.int32), np.zeros((len(neighbours), width), bool)
-    for point, near in enumerate(neighbours):
+    """The library's answer; neighbors of each point, nearest first."""
+    width = max(1, *map(len, neighbors))
+    index, adjoining = np.zeros((len(neighbors), width), np.int32), np.zeros((len(neighbors), width), bool)
+    for point, near in enumerate(neighbors):
         index[point, : len(near)], adjoining[point, : len(near)] = near, True
-    around = Neighbourhood(np.ones(len(neighbours), np.float32), index, adjoining)
+    around = Neighborhood(np.ones(len(neighbors), np.float32), index, adjoining)
     groups = MaskGroups(int32(group), max(group) + 1, np.zeros(len(group), bool))
     return assign_points(table, view_votes(table), groups, around, settings or MembershipSettings(), rgb)
 
