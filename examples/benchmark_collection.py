@@ -206,7 +206,7 @@ def right_scenes(captures: list[Path], fitted: Path) -> None:
 
 
 def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncoder) -> None:
-    """Scenes on a square kilometre, each of ten metres."""
+    """Scenes on a square kilometer, each of ten meters."""
     with Atlas.writing(path) as atlas:
         atlas.note("root", str(path.parent.resolve()))
         words = atlas.add_words(encoder.words.names, encoder.words.vectors)

@@ -26,7 +26,7 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 Depth = NDArray[np.floating]
 DEPTH: dict[str, Callable[[Depth, Camera], Depth]] = {
     "none": lambda depth, camera: depth,
-    "millimetres": lambda depth, camera: depth * 1000,
+    "millimeters": lambda depth, camera: depth * 1000,
     "times 0.2": lambda depth, camera: depth * 0.2,
     "times 1.2": lambda depth, camera: depth * 1.2,
     "times 1.5": lambda depth, camera: depth * 1.5,
@@ -40,9 +40,9 @@ DEPTH: dict[str, Callable[[Depth, Camera], Depth]] = {
     "20 pixels off": lambda depth, camera: np.roll(depth, 20, axis=2),
     "turned": lambda depth, camera: depth[:, ::-1, ::-1],
 }
-"""Faults of (V, H, W) depth images in metres."""
+"""Faults of (V, H, W) depth images in meters."""
 CAMERAS: dict[str, Callable[[Camera], Camera]] = {
-    "poses in millimetres": lambda camera: replace(camera, world_to_camera=scaled(camera.world_to_camera, 1000)),
+    "poses in millimeters": lambda camera: replace(camera, world_to_camera=scaled(camera.world_to_camera, 1000)),
     "OpenCV axes": lambda camera: replace(camera, world_to_camera=OPENCV @ camera.world_to_camera),
     "world-to-camera": lambda camera: replace(camera, world_to_camera=np.linalg.inv(camera.world_to_camera)),
     "half intrinsics": lambda camera: replace(
@@ -66,7 +66,7 @@ def main(seeds: list[int]) -> None:
 
 
 def said_of(depth: Depth, cameras: list[Camera]) -> str:
-    """What the check says of depth images (V, H, W) in metres with these cameras."""
+    """What the check says of depth images (V, H, W) in meters with these cameras."""
     with tempfile.TemporaryDirectory() as folder:
         frames = []
         for number, (image, camera) in enumerate(zip(depth, cameras, strict=True)):

@@ -45,7 +45,7 @@ TEXTURED, FALLS_OFF_M = 60, 0.35
 OFF_M, STRAY, STRAY_M = 0.008, 0.01, 0.3
 """Its points' noise; the share of its strays, and how far off these are."""
 SPARSE_POSES = 0.005, 0.1
-"""Its poses' noise: metres, degrees."""
+"""Its poses' noise: meters, degrees."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -91,11 +91,11 @@ def frames_of(folder: Path, options: argparse.Namespace) -> tuple[Scene, list[og
     return capture, frames
 
 
-def _moved(camera: Camera, random: np.random.Generator, metres: float, degrees: float) -> Camera:
+def _moved(camera: Camera, random: np.random.Generator, meters: float, degrees: float) -> Camera:
     turn = rotation_of_vector(random.normal(size=3) * np.deg2rad(degrees) / np.sqrt(3))
     pose = camera.world_to_camera.copy()
     pose[:3] = turn @ pose[:3]
-    pose[:3, 3] += random.normal(size=3) * metres / np.sqrt(3)
+    pose[:3, 3] += random.normal(size=3) * meters / np.sqrt(3)
     return replace(camera, world_to_camera=pose)
 
 

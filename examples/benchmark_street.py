@@ -30,7 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=2_000_000)
     parser.add_argument("--views", type=int, default=60)
-    parser.add_argument("--length", type=float, default=200.0, help="metres")
+    parser.add_argument("--length", type=float, default=200.0, help="meters")
     parser.add_argument("--tile-points", type=int, default=500_000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--memory", default="4GB", help="limit of each worker")

@@ -6,7 +6,7 @@ its blending weights change, and the gradient runs back through the blending. Of
 
     dM / da_i = T_i f_i - (sum_{j>i} T_j a_j f_j) / (1 - a_i)
 
-and of ``a = o exp(-q / 2)``, ``q = d' C^-1 d``, ``C = s^2 C0 + LOW_PASS I`` at an offset d from the splat's centre
+and of ``a = o exp(-q / 2)``, ``q = d' C^-1 d``, ``C = s^2 C0 + LOW_PASS I`` at an offset d from the splat's center
 
     da / do = a / o        da / dlog s = a (q - LOW_PASS |C^-1 d|^2)
 """
@@ -60,7 +60,7 @@ def train_with_shapes(
         adam.step()
     trained = RenderedViews(reshaped(base, logit, log_size), source.views, near, settings, whole=False)
     features = np.zeros((len(base), settings.width), np.float32)
-    features[trained.known] = read_features(raw.detach().numpy()[trained.known], normalise=True)
+    features[trained.known] = read_features(raw.detach().numpy()[trained.known], normalize=True)
     return raw.detach().numpy(), features, trained
 
 

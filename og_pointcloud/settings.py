@@ -149,7 +149,7 @@ class _LossSettings(_Checked):
 
     width: int = 6
     """Columns of a feature (paper, Sec. 3.1)."""
-    normalise: bool = True
+    normalize: bool = True
     """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
     intra: bool = True
     """Use the intra-mask smoothing loss (Eq. 1)."""
@@ -351,4 +351,4 @@ class ChoosingSettings(_Checked):
     kinds: int = 20
     """Kinds of things that an instance may be, if fewer labels are asked: each label then has one share of so many."""
     synonym: float = 0.6
-    """A bank word this close to a label (cosine, centred) means the same and does not speak against it: cup and mug."""
+    """A bank word this close to a label (centered cosine) means the same and does not speak against it: cup and mug."""

@@ -119,7 +119,7 @@ def write_transforms(folder: Path, world: World, per_frame=False, suffix=".png",
     frames = []
     for image, pose in zip(world.names, world.poses, strict=True):
         camera_to_world = np.linalg.inv(pose) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        # A camera far from the origin: inverting the pose would lose digits that the centre has.
+        # A camera far from the origin: inverting the pose would lose digits that the center has.
         frame = {"file_path": f"images/{image}{suffix}", "transform_matrix": camera_to_world.tolist()}
         frames.append({**frame, **shared} if per_frame else frame)
     content = {**({} if per_frame else shared), "frames": frames, **keys}

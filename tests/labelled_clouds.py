@@ -87,7 +87,7 @@ def tough_clouds() -> dict[str, LabelledCloud]:
         ),
         "instances without any descriptor": replace(base, instances=instance_table(9, [])),
         "map coordinates": replace(base, origin=np.array([1e6, -4e6, 350.25])),
-        "millimetres": make_cloud(base.xyz * 1000, base.instance_ids, 50.0, 150.0),
+        "millimeters": make_cloud(base.xyz * 1000, base.instance_ids, 50.0, 150.0),
         "coincident points of different ids": make_cloud(twice, np.append(base.instance_ids, base.instance_ids[::-1])),
         "all points in one place": make_cloud(np.ones((50, 3)), np.arange(50) % 3),
         "far outliers": make_cloud(far, np.append(base.instance_ids, [2, 3, 1])),

@@ -212,7 +212,7 @@ MUTATIONS = (
     ),
     # Choosing.
     Mutation(
-        "words not centred", "ask/choosing.py",
+        "words not centered", "ask/choosing.py",
         "directions = unit_rows(unit_rows(texts) - self.bank.mean)\n        scores",
         "directions = unit_rows(texts)\n        scores", CHOOSING,
     ),

@@ -85,7 +85,7 @@ def reference_alpha(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.
 
 
 def projected_covariance(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.longdouble]:
-    """(2, 2) covariance in px^2: J W Sigma W' J' + 0.3 I, with J the Jacobian of the projection at the centre.
+    """(2, 2) covariance in px^2: J W Sigma W' J' + 0.3 I, with J the Jacobian of the projection at the center.
 
     J is taken at most 0.3 half fields of view outside the image, as in 3DGS (1.3 tan(fov/2)).
     """

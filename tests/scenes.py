@@ -24,7 +24,7 @@ FEATURE_SPACE = "tiny-test-space"
 FEATURE_WIDTH = 16
 CENTERS = np.array([[-0.6, 0.0, 0.5], [0.6, 0.1, 0.5]])
 RADIUS = 0.5
-COLOURS = np.array([[200, 40, 40], [40, 40, 200], [120, 120, 120]], np.uint8)  # the last one is the floor's
+COLORS = np.array([[200, 40, 40], [40, 40, 200], [120, 120, 120]], np.uint8)  # the last one is the floor's
 WIDTH, HEIGHT, FOCAL_PX = 120, 90, 110.0
 FLOOR = -1
 
@@ -57,7 +57,7 @@ def write_tiny_capture(folder: Path, view_count: int = 6) -> TinyCapture:
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     xyz, object_ids = sample_surfaces()
-    write_ply(folder / "points.ply", xyz, COLOURS[object_ids])
+    write_ply(folder / "points.ply", xyz, COLORS[object_ids])
 
     vectors = np.linalg.qr(random.normal(size=(FEATURE_WIDTH, FEATURE_WIDTH)))[0].astype(np.float32)[:3]
     frames, features = [], {}
@@ -71,7 +71,7 @@ def write_tiny_capture(folder: Path, view_count: int = 6) -> TinyCapture:
         order = random.permutation(len(NAMES))  # mask ids mean nothing across views
         mask = np.append(order + 1, 0)[object_map].astype(np.uint16)
         cv2.imwrite(str(folder / "masks" / f"{stem}.png"), mask)
-        cv2.imwrite(str(folder / "images" / f"{stem}.png"), COLOURS[object_map][..., ::-1])
+        cv2.imwrite(str(folder / "images" / f"{stem}.png"), COLORS[object_map][..., ::-1])
         rows = np.argsort(order)
         features[stem] = vectors[rows] + 0.05 * random.normal(size=(len(rows), FEATURE_WIDTH)).astype(np.float32)
         frames.append({"file_path": f"images/{stem}.png", "transform_matrix": camera_to_world.tolist()})
@@ -143,7 +143,7 @@ def room_poses(count: int = 12, offset=(0.0, 0.0, 0.0)):
 
 
 def look(pose, offset=(0.0, 0.0, 0.0), size=ROOM_SIZE, intrinsics=None):
-    """Exact depth (H, W) float64 and colors (H, W, 3) of the room. intrinsics: fx fy cx cy, pixel centres at +0.5."""
+    """Exact depth (H, W) float64 and colors (H, W, 3) of the room. intrinsics: fx fy cx cy, pixel centers at +0.5."""
     ray, eye = rays(camera(pose, size, intrinsics)), pose[:3, 3] - offset
     with np.errstate(divide="ignore"):
         to_walls = np.where(ray > 0, ROOM[1] - eye, ROOM[0] - eye) / ray

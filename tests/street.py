@@ -39,7 +39,7 @@ GROUND, SKY = -1, -2
 
 @dataclass(frozen=True)
 class Street:
-    """Solids in metres, x along the street, z up, the road at z = 0. low, high: (s, 3) corners. round: (s,) bool,
+    """Solids in meters, x along the street, z up, the road at z = 0. low, high: (s, 3) corners. round: (s,) bool,
     ellipsoids within their corners, else boxes. owner: (s,) the object of each. cls: (objects,) row of CLASSES."""
 
     low: Floats
@@ -51,7 +51,7 @@ class Street:
 
     @classmethod
     def build(cls, length_m: float, rng: np.random.Generator) -> Street:
-        """As many houses, cars, lamps and trees as there is room for along so many metres."""
+        """As many houses, cars, lamps and trees as there is room for along so many meters."""
         solids: list[tuple[list[float], list[float], bool, int]] = []
         classes: list[int] = []
 
@@ -115,7 +115,7 @@ class Street:
         return xyz[order], owner[order].astype(np.int16)
 
     def look(self, camera: Camera) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
-        """(H, W) int16, the object, GROUND or SKY that each pixel shows, and (H, W) float32, its depth in metres."""
+        """(H, W) int16, the object, GROUND or SKY that each pixel shows, and (H, W) float32, its depth in meters."""
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         pose, near = camera.world_to_camera, self.in_sight(camera)
         solids = self.low[near], self.high[near], self.round[near], self.owner[near]
@@ -189,7 +189,7 @@ def _cast(low, high, round_, owner, pose, eye, intrinsics, width, height):
 
 
 def colors(xyz: NDArray[np.floating], owner: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """(n, 3) uint8: a color an object, in squares of half a metre, so that images can tell places apart."""
+    """(n, 3) uint8: a color an object, in squares of half a meter, so that images can tell places apart."""
     hues = 70 + 150 * np.modf(0.618 * np.arange(owner.max(initial=0) + 1)[:, None] + np.array([0.0, 0.35, 0.6]))[0]
     palette = np.concatenate([hues, [[150, 190, 230], [95, 95, 100]]])  # SKY and GROUND are rows -2 and -1
     squares = np.floor(2 * np.clip(xyz, -FARTHEST_M, FARTHEST_M) + 0.25).astype(np.int32)

@@ -61,7 +61,7 @@ def write_nerfstudio(folder, world):
 
 
 def write_blender(folder, world):
-    """Square pixels and a centred principal point are all that this format can say."""
+    """Square pixels and a centered principal point are all that this format can say."""
     write_transforms(folder, world, suffix="", name="transforms_train.json")
     content = json.loads((folder / "transforms_train.json").read_text())
     content = {"camera_angle_x": 2 * np.arctan(0.5 * WIDTH / world.intrinsics[0]), "frames": content["frames"]}

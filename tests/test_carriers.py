@@ -23,7 +23,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 @pytest.fixture(scope="module")
 def asked(scene):
-    """A scene, points that carriers of float32 and of whole tenths of millimetres hold exactly, and their labels."""
+    """A scene, points that carriers of float32 and of whole tenths of millimeters hold exactly, and their labels."""
     random = np.random.default_rng(1)
     points = scene.xyz + random.normal(size=scene.xyz.shape) * 0.3 * scene.cloud.spacing
     points = (np.round(points * 8192) / 8192).astype(np.float32).astype(np.float64)
@@ -159,7 +159,7 @@ def test_words_may_come_as_tensors_as_a_model_gives_them(asked):
     assert og.segment(scene, {name: vector.bfloat16() for name, vector in words.items()}).labels.tolist() == expected
 
 
-def test_las_keeps_labels_and_a_millimetre_at_a_million(tmp_path):
+def test_las_keeps_labels_and_a_millimeter_at_a_million(tmp_path):
     laspy = pytest.importorskip("laspy")
     cloud = make_cloud(room(800).xyz * 300, room(800).instance_ids, 15.0, 45.0, origin=(1e6, -4e6, 350.25))
     result = og.segment(og.load(write_bundle(cloud, tmp_path / "map.ogpc")), WORDS)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import error_of, output_of, run
 from scenes import (
-    COLOURS,
+    COLORS,
     NAMES,
     UNUSED_NAME,
     sample_surfaces,
@@ -65,7 +65,7 @@ def test_other_points_keep_their_order(fitted, tmp_path, capsys):
     capture, bundle = fitted
     order = np.random.default_rng(1).permutation(len(capture.object_ids))
     xyz, object_ids = sample_surfaces()
-    write_ply(tmp_path / "shuffled.ply", xyz[order], COLOURS[object_ids][order])
+    write_ply(tmp_path / "shuffled.ply", xyz[order], COLORS[object_ids][order])
     whole, shuffled = tmp_path / "whole.npz", tmp_path / "shuffled.npz"
     assert run(capsys, "segment", bundle, "-o", whole)[0] == 0
     assert run(capsys, "segment", bundle, "--points", tmp_path / "shuffled.ply", "-o", shuffled)[0] == 0
@@ -76,7 +76,7 @@ def test_points_in_a_frame_of_their_own_are_placed_by_a_pose(fitted, tmp_path, c
     _, bundle = fitted
     xyz, object_ids = sample_surfaces()
     pose = np.array([[0.0, -1, 0, 5], [1, 0, 0, -3], [0, 0, 1, 2], [0, 0, 0, 1]])
-    write_ply(tmp_path / "scan.ply", (xyz - pose[:3, 3]) @ pose[:3, :3], COLOURS[object_ids])
+    write_ply(tmp_path / "scan.ply", (xyz - pose[:3, 3]) @ pose[:3, :3], COLORS[object_ids])
     np.savetxt(tmp_path / "pose.txt", pose)
     asked = "segment", bundle, "--points", tmp_path / "scan.ply", "--pose", tmp_path / "pose.txt"
     stdout = output_of(capsys, *asked, "-o", tmp_path / "placed.ply")

@@ -34,7 +34,7 @@ def test_binary_and_text_hold_the_same_world(tmp_path, write, offset):
     np.testing.assert_array_equal(rgb, world.rgb)
 
 
-def test_scaled_quaternions_are_normalised(tmp_path):
+def test_scaled_quaternions_are_normalized(tmp_path):
     world = make_world()
     write_colmap_binary(tmp_path, world, poses=np.hstack([world.quaternions * 3.0, world.translations]))
     assert all(map(same_camera, [image.camera for image in read_images(tmp_path)], expected_cameras(world)))

@@ -18,7 +18,7 @@ from og_pointcloud.formats.rgbd import COLOR_FOCAL_PX, DEPTH_FOCAL_PX
 
 COUNT = 6
 LENS = (130.0, 131.0, 79.0, 60.5)
-"""fx fy cx cy with pixel centres at whole numbers, as these data sets state them; the scene adds 0.5 to cx, cy."""
+"""fx fy cx cy with pixel centers at whole numbers, as these data sets state them; the scene adds 0.5 to cx, cy."""
 OURS = (LENS[0], LENS[1], LENS[2] + 0.5, LENS[3] + 0.5)
 SIZE = WIDTH, HEIGHT = ROOM_SIZE
 
@@ -35,8 +35,8 @@ def write_scannet(folder: Path):
     for name in ("pose", "intrinsic"):
         (folder / name).mkdir(parents=True)
     for index, pose in enumerate(room_poses(COUNT)):
-        centred = (color_lens[0], color_lens[1], color_lens[2] + 0.5, color_lens[3] + 0.5)
-        write_rgb(folder / f"color/{index * 5}.jpg", look(pose, size=color_size, intrinsics=centred)[1])
+        centered = (color_lens[0], color_lens[1], color_lens[2] + 0.5, color_lens[3] + 0.5)
+        write_rgb(folder / f"color/{index * 5}.jpg", look(pose, size=color_size, intrinsics=centered)[1])
         write_depth(folder / f"depth/{index * 5}.png", look(pose, intrinsics=OURS)[0])
         np.savetxt(folder / f"pose/{index * 5}.txt", pose)
     np.savetxt(folder / "intrinsic/intrinsic_color.txt", matrix(color_lens))
@@ -220,7 +220,7 @@ def test_a_depth_folder_beside_the_images_is_found(tmp_path):
     assert distance_to_surface(read_capture(tmp_path).points.xyz_world).max() < 0.03
 
 
-def test_poses_in_millimetres_with_depth_in_metres_are_doubted(tmp_path):
+def test_poses_in_millimeters_with_depth_in_meters_are_doubted(tmp_path):
     nerfstudio(tmp_path)
     content = json.loads((tmp_path / "transforms.json").read_text())
     for frame in content["frames"]:

@@ -31,7 +31,7 @@ def read(path, **keys):
 # Files ----------------------------------------------------------------------------------------------------------
 
 
-def test_whole_numbers_are_millimetres_and_floats_are_lengths(tmp_path):
+def test_whole_numbers_are_millimeters_and_floats_are_lengths(tmp_path):
     depth, _ = look(POSE)
     write_depth(tmp_path / "a.png", depth)
     np.save(tmp_path / "b.npy", depth.astype(np.float32))
@@ -190,20 +190,20 @@ def test_one_view_is_enough(tmp_path):
     assert fused.survey.noise == 0
 
 
-def test_order_of_frames_and_metres_or_millimetres_do_not_matter(tmp_path):
+def test_order_of_frames_and_meters_or_millimeters_do_not_matter(tmp_path):
     frames = write_frames(tmp_path, 6)
     fused = fuse(frames)
     turned = fuse(frames[::-1])
     np.testing.assert_allclose(np.sort(turned.points.xyz_world, 0), np.sort(fused.points.xyz_world, 0), atol=1e-5)
 
-    def in_millimetres(frame):
+    def in_millimeters(frame):
         pose = frame.depth.camera.world_to_camera.copy()
         pose[:3, 3] *= 1000
         lens = frame.depth.camera
         moved = camera(np.linalg.inv(pose), (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy))
         return DepthFrame(frame.name, DepthFile(frame.depth.path, moved, 1.0), frame.colors)
 
-    large = fuse([in_millimetres(frame) for frame in frames])
+    large = fuse([in_millimeters(frame) for frame in frames])
     assert large.survey.voxel == pytest.approx(1000 * fused.survey.voxel, rel=1e-4)
     assert abs(len(large.points) - len(fused.points)) < 0.01 * len(fused.points)
 

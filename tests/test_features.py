@@ -1,4 +1,4 @@
-"""Losses of the mask table against literal rendering with automatic gradients, and what the optimisation must do."""
+"""Losses of the mask table against literal rendering with automatic gradients, and what the optimization must do."""
 
 from __future__ import annotations
 
@@ -163,17 +163,17 @@ def test_points_bound_what_covered_pixels_show() -> None:
     assert 0.1 * bound < shown < bound
 
 
-@pytest.mark.parametrize("normalise", [True, False])
-def test_gradient_by_raw_features_equals_the_automatic_one(normalise: bool) -> None:
+@pytest.mark.parametrize("normalize", [True, False])
+def test_gradient_by_raw_features_equals_the_automatic_one(normalize: bool) -> None:
     rng = np.random.default_rng(0)
     raw = rng.normal(size=(30, WIDTH)) * rng.uniform(0.1, 1.5, (30, 1))
     by_read = rng.normal(size=raw.shape)
     f = torch.tensor(raw, requires_grad=True)
     length = f.norm(dim=1, keepdim=True)
-    read = 0.5 + 0.5 * f / length if normalise else f / length.clamp(min=1)
+    read = 0.5 + 0.5 * f / length if normalize else f / length.clamp(min=1)
     (read * torch.tensor(by_read)).sum().backward()
-    np.testing.assert_allclose(read_features(raw, normalise), read.detach().numpy(), rtol=1e-14)
-    pulled = raw_gradient(raw, by_read, normalise)
+    np.testing.assert_allclose(read_features(raw, normalize), read.detach().numpy(), rtol=1e-14)
+    pulled = raw_gradient(raw, by_read, normalize)
     np.testing.assert_allclose(pulled, f.grad.numpy(), rtol=1e-12, atol=1e-14)
 
 
@@ -185,7 +185,7 @@ def test_product_equals_scipy() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [FeatureSettings(), FeatureSettings(normalise=False), FeatureSettings(width=2)])
+@pytest.mark.parametrize("settings", [FeatureSettings(), FeatureSettings(normalize=False), FeatureSettings(width=2)])
 def test_objects_come_apart_and_keep_together(
     tiny: Rendered, tiny_capture: TinyCapture, settings: FeatureSettings
 ) -> None:

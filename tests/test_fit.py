@@ -176,7 +176,7 @@ NO_SHIFT = np.zeros(3)
         (np.eye(3), 0.001, NO_SHIFT),
         (np.eye(3), 1.0, np.array([1e6, -3e6, 500])),
     ],
-    ids=["rotated", "millimetres", "kilometres", "map offset"],
+    ids=["rotated", "millimeters", "kilometers", "map offset"],
 )
 def test_world_frame_and_unit_do_not_matter(
     known: Known, labelled: LabelledCloud, turn: NDArray[np.float64], unit: float, shift: NDArray[np.float64]

@@ -137,7 +137,7 @@ def test_packed_colors_keep_their_bits_whatever_type_the_file_gives_them(tmp_pat
     assert points.xyz_world.tolist() == [[1e6, 2, 3]]
 
 
-def test_invalid_points_of_an_organised_cloud_are_left_out_of_fits_and_answered_unknown_in_their_rows(tmp_path):
+def test_invalid_points_of_an_organized_cloud_are_left_out_of_fits_and_answered_unknown_in_their_rows(tmp_path):
     header = "VERSION 0.7\r\nFIELDS x y z\r\nSIZE 4 4 4\r\nTYPE F F F\r\nWIDTH 3\r\nHEIGHT 2\r\nDATA binary\r\n"
     xyz = np.arange(18, dtype="<f4").reshape(6, 3)
     path = tmp_path / "a.pcd"

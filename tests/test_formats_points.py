@@ -31,7 +31,7 @@ def test_a_cloud_without_colors_or_normals(tmp_path):
     assert (points.rgb, points.are_gaussians) == (None, False)
 
 
-def test_map_coordinates_keep_their_millimetres(tmp_path):
+def test_map_coordinates_keep_their_millimeters(tmp_path):
     offset = np.array([4.5e6, -5.2e6, 300.0])
     points = read_points(write_cloud(tmp_path / "a.ply", XYZ + offset))
     np.testing.assert_allclose(points.xyz_world, XYZ + offset, rtol=0, atol=1e-6)

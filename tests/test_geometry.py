@@ -69,9 +69,9 @@ def test_order_of_points_does_not_matter(random: Generator) -> None:
 
 def test_unit_of_length_scales_the_spacing(random: Generator) -> None:
     xyz = random.normal(size=(300, 3)).astype(np.float32)
-    metres, millimetres = neighborhood(xyz, SETTINGS), neighborhood(xyz * np.float32(1024), SETTINGS)
-    np.testing.assert_array_equal(millimetres.spacing, metres.spacing * 1024)
-    np.testing.assert_array_equal(millimetres.adjoining, metres.adjoining)
+    meters, millimeters = neighborhood(xyz, SETTINGS), neighborhood(xyz * np.float32(1024), SETTINGS)
+    np.testing.assert_array_equal(millimeters.spacing, meters.spacing * 1024)
+    np.testing.assert_array_equal(millimeters.adjoining, meters.adjoining)
 
 
 def test_a_floater_has_the_spacing_of_the_surface_it_left() -> None:
@@ -153,7 +153,7 @@ def test_a_strided_camera_sees_the_strided_pixels(width: int, height: int, strid
     first = stride // 2
     kept = np.zeros((height, width))[first::stride, first::stride]
     assert (small.height, small.width) == kept.shape
-    # The ray of every pixel centre of the small camera is that of the pixel it stands for.
+    # The ray of every pixel center of the small camera is that of the pixel it stands for.
     column, row = np.meshgrid(np.arange(small.width), np.arange(small.height))
     ray_x, ray_y = (column + 0.5 - small.cx) / small.fx, (row + 0.5 - small.cy) / small.fy
     np.testing.assert_allclose(camera.fx * ray_x + camera.cx, first + stride * column + 0.5, atol=1e-9)

@@ -260,7 +260,7 @@ def test_each_ray_that_the_lens_saw_is_in_exactly_one_face_at_its_pixel(name):
         place = np.stack([number % camera.width, number // camera.width], axis=1) + 0.5
         apart = np.abs(place - at[inside])
         apart[:, 0] = np.minimum(apart[:, 0], np.where(made.wraps, camera.width - apart[:, 0], apart[:, 0]))
-        # A pixel of a face is hardly wider than the image's; the ray meets it up to half of that beside its centre.
+        # A pixel of a face is hardly wider than the image's; the ray meets it up to half of that beside its center.
         near_pole = np.abs(in_camera[inside, 1]) > 0.7 * np.linalg.norm(in_camera[inside], axis=1)
         assert np.percentile(apart[found & seen[inside] & ~(near_pole & made.wraps)], 99) < 1.1
         shown[np.flatnonzero(inside)[found]] += 1

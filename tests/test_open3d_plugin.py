@@ -113,7 +113,7 @@ def test_reading_refuses_what_open3d_reads_as_nothing(scene, tmp_path):
     open3d.io.write_point_cloud(str(tmp_path / "D.PCD"), legacy_cloud(scene))
     for damaged in (path, tmp_path / "D.PCD"):
         damaged.write_bytes(damaged.read_bytes()[:-50])
-        with pytest.raises(SceneError, match=f"{damaged.name}: .*truncated"):  # Open3D returns uninitialised memory
+        with pytest.raises(SceneError, match=f"{damaged.name}: .*truncated"):  # Open3D returns uninitialized memory
             og3.read(damaged)
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n2\n")
     with pytest.raises(SceneError, match="no column y, z"):

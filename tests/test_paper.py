@@ -137,16 +137,16 @@ def test_a_device_that_is_not_there_is_refused(balls: Balls, name: str) -> None:
 
 def test_reading_has_the_gradient_of_plain_operations() -> None:
     zero = torch.zeros((2, 6), dtype=torch.float64, requires_grad=True)
-    assert (paper._read(zero, normalise=True) == 0.5).all()
-    paper._read(zero, normalise=True).sum().backward()
+    assert (paper._read(zero, normalize=True) == 0.5).all()
+    paper._read(zero, normalize=True).sum().backward()
     assert (zero.grad == 0).all()
     raw = torch.rand((50, 6), dtype=torch.float64, requires_grad=True)
     pull = torch.rand((50, 6), dtype=torch.float64)
     plain = 0.5 + 0.5 * torch.nn.functional.normalize(raw, dim=1)
-    read = paper._read(raw, normalise=True)
+    read = paper._read(raw, normalize=True)
     torch.testing.assert_close(read, plain)
     torch.testing.assert_close(torch.autograd.grad(read, raw, pull), torch.autograd.grad(plain, raw, pull))
-    assert paper._read(raw, normalise=False) is raw
+    assert paper._read(raw, normalize=False) is raw
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -175,7 +175,7 @@ def test_equal_means_give_finite_losses_and_gradients() -> None:
         assert torch.isfinite(gradient).all()
 
 
-AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e3, feature_rate=4e-2)
+AS_PRINTED = replace(SHORT, formula="paper", normalize=False, cohesion_weight=3e3, feature_rate=4e-2)
 OF_AUTHORS = replace(SHORT, cluster_raw=True, fine_alone=True)
 
 
@@ -250,7 +250,7 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
 
 def test_a_codebook_step_moves_features_by_the_gradient_of_their_centers(balls: Balls) -> None:
     """Straight through: Adam's first step is the rate against the sign of W' sign(W c - W f), c the centers' rows."""
-    settings = replace(SHORT, formula="paper", normalise=False, k1=4, schedule_share=1 / 20_000)
+    settings = replace(SHORT, formula="paper", normalize=False, k1=4, schedule_share=1 / 20_000)
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
     source = rendered_views.RenderedViews(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
     features = features[source.known]

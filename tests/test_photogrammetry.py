@@ -77,7 +77,7 @@ def test_cameras_of_metashape(tmp_path):
 
 @pytest.mark.parametrize("where", ["chunk", "component"])
 def test_a_chunks_transform_takes_cameras_to_the_world(tmp_path, where):
-    """Also to geocentric coordinates, six million metres away, and by a scale."""
+    """Also to geocentric coordinates, six million meters away, and by a scale."""
     world = make_world(offset=(4e6, 3e5, 5e6))
     rotation = make_world(seed=5).poses[0][:3, :3]
     placed = (3.7, rotation, np.array([4e6, 3e5, 5e6]))

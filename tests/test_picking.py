@@ -19,7 +19,7 @@ from og_pointcloud.scene import Camera
 
 
 def looking(position, target, width=40, height=30, focal=30.0):
-    """A camera in world coordinates at ``position`` whose image centre shows ``target``; world z is up."""
+    """A camera in world coordinates at ``position`` whose image center shows ``target``; world z is up."""
     pose = pinhole.looking(position, np.subtract(target, position))
     return Camera(width, height, focal, 1.1 * focal, width / 2 + 0.3, height / 2 - 0.2, pose)
 
@@ -125,7 +125,7 @@ def scaled(cloud, camera, factor):
     return smaller, replace(camera, world_to_camera=pose)
 
 
-def test_map_coordinates_and_millimetres_change_nothing():
+def test_map_coordinates_and_millimeters_change_nothing():
     cloud = room()
     expected = front_points(cloud, FROM_ABOVE)
     assert np.array_equal(front_points(*moved(cloud, FROM_ABOVE, np.array([1e6, -2e6, 300]))), expected)

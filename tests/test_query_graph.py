@@ -133,7 +133,7 @@ def test_the_size_of_a_cell_changes_no_answer(monkeypatch, cell_per_spacing):
     assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
 
 
-def test_without_lists_the_centre_of_a_box_answers_for_it(monkeypatch):
+def test_without_lists_the_center_of_a_box_answers_for_it(monkeypatch):
     cloud = CLOUDS["room"]
     points = cloud.xyz + np.float32(0.3 * cloud.spacing) * np.random.default_rng(0).normal(size=cloud.xyz.shape)
     exact = instances_plainly(cloud, points.astype(np.float32))
@@ -294,7 +294,7 @@ def test_distance_is_surface_near_or_beyond():
     true = np.linalg.norm(points[:, None].astype(np.float64) - cloud.xyz, axis=2).min(axis=1)
     assert ((found["distance"] == BEYOND) == (found["instance"] == TOO_FAR)).all()
     assert ((found["distance"] == BEYOND) == (true > cloud.reach)).all()
-    # Between the first two, a cell's centre speaks for the cell.
+    # Between the first two, a cell's center speaks for the cell.
     half_diagonal, surface = cell * np.sqrt(3) / 2, surface_distance(cloud.spacing, cloud.reach)
     assert (found["distance"][true <= surface - half_diagonal] == ON_SURFACE).all()
     assert (found["distance"][(true > surface + half_diagonal) & (true <= cloud.reach)] == NEAR).all()

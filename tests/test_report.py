@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from commands import error_of
-from scenes import COLOURS, NAMES, write_ply, write_tiny_capture
+from scenes import COLORS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
@@ -138,7 +138,7 @@ def test_points_at_one_place_are_fitted_as_a_fit_does(folder, subject, tmp_path)
     points = subject.scene.points
     place = np.concatenate([np.arange(len(points)), np.arange(0, len(points), 3)])
     world = points.xyz_world[place]
-    write_ply(twice / "points.ply", world.astype(np.float32), np.broadcast_to(COLOURS[0], (len(place), 3)))
+    write_ply(twice / "points.ply", world.astype(np.float32), np.broadcast_to(COLORS[0], (len(place), 3)))
     truth = subject.truth
     np.savez(twice / "gt.npz", names=truth.names, cls=truth.cls[place], background=truth.background[place])
     again = read_subject(twice)
@@ -201,7 +201,7 @@ def test_direct_uplift_is_the_weighted_mean_word_by_word(subject, prepared):
     np.testing.assert_array_equal(BASELINES["direct uplift"](prepared, words), literal)
 
 
-def test_center_sampling_reads_the_pixel_of_each_centre(subject, prepared):
+def test_center_sampling_reads_the_pixel_of_each_center(subject, prepared):
     scene, table, words = subject.scene, prepared.table, subject.vocabulary.vectors
     labels = prepared.surface.of_points(BASELINES["center sampling"](prepared, words))
     exposure, similarity = prepared.surface.of_points(table.exposure.toarray().T).T, table.unit_features @ words.T

@@ -196,7 +196,7 @@ def test_without_noise_points_lie_on_surfaces_and_masks_are_objects():
             assert capture.room.objects[instance].name in CLASS_NAMES
 
 
-def test_points_project_to_the_centres_of_their_pixels():
+def test_points_project_to_the_centers_of_their_pixels():
     """Pose, intrinsics, depth and color fit together: one view's exact points fall back on their own pixels."""
     settings = CaptureSettings(
         views=1, width=160, height=120, samples_per_view=3000, depth_noise=0, flying=0, outliers=0, range_m=9

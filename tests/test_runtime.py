@@ -85,14 +85,14 @@ def test_a_point_of_the_cloud_finds_its_own_id(name):
     assert (quietly(scene, words).labels == quietly(scene.xyz, words, scene).labels).all()
 
 
-def test_metres_millimetres_and_map_coordinates_answer_alike(scene):
+def test_meters_millimeters_and_map_coordinates_answer_alike(scene):
     cloud = scene.cloud
     points = queries(cloud, 300)[:900].astype(np.float64)
-    metres = scene.instances_at(points)
+    meters = scene.instances_at(points)
     kilo = make_cloud(cloud.xyz * 1024, cloud.instance_ids, cloud.spacing * 1024, cloud.reach * 1024)
     shifted = replace(cloud, origin=np.array([2.0**20, -(2.0**22), 2.0**9]))
-    assert (runtime.as_scene(kilo).instances_at(points * 1024) == metres).all()
-    assert (runtime.as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
+    assert (runtime.as_scene(kilo).instances_at(points * 1024) == meters).all()
+    assert (runtime.as_scene(shifted).instances_at(points + shifted.origin) == meters).all()
 
 
 @pytest.mark.parametrize("points", [np.zeros(3), np.zeros((2, 4)), np.zeros((1, 2, 3)), np.zeros((2, 3), complex)])

@@ -34,7 +34,7 @@ def gaussians(xyz: NDArray[np.floating], scale: float | NDArray[np.floating], op
 
 
 def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(n,): the product of (1 - alpha) at each centre's pixel over all that lies more than thickness before it."""
+    """(n,): the product of (1 - alpha) at each center's pixel over all that lies more than thickness before it."""
     depth = np.array([in_camera(splats, g, camera)[2] for g in range(len(splats))])
     alphas = {h: reference_alpha(splats, h, camera) for h in range(len(splats)) if depth[h] > NEAR}
     found = np.zeros(len(splats))

@@ -234,7 +234,7 @@ def test_nothing_in_view_gives_empty_rows(random: Generator) -> None:
 
 
 def test_one_splat_by_hand() -> None:
-    """A point-like splat on a pixel centre: covariance 0.3, so alpha falls with exp(-d^2 / 0.6)."""
+    """A point-like splat on a pixel center: covariance 0.3, so alpha falls with exp(-d^2 / 0.6)."""
     view = camera(5, 5, 10.0, fy=10.0)
     splat = Gaussians(
         np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.float32), IDENTITY[None], np.float32([0.5])

@@ -66,7 +66,7 @@ class CaptureSettings:
 class RoomCapture:
     """All that a capture folder holds, and the truth.
 
-    masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 metres, rgb (n, 3)
+    masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 meters, rgb (n, 3)
     uint8. cls, instance: (n,) int32 class and object of each point, -1 where it has none; background: (n,) bool, on
     walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
     outlier, or noise that carried the point over to another surface. bank_vectors: (B, 512) float32, our everyday

@@ -1,7 +1,7 @@
 """Models of furniture and of the things that stand on it, drawn from a random generator.
 
 Single things (``mug``, ``book`` ...) return one :class:`Item` standing on the origin. Groups (``sofa_group`` ...)
-return furniture together with what lies on it, in a frame with the floor at z = 0, the footprint centred on the
+return furniture together with what lies on it, in a frame with the floor at z = 0, the footprint centered on the
 origin, and the back, which goes to the wall, at +y.
 """
 
@@ -33,7 +33,7 @@ class Item:
 
     @property
     def vertices(self) -> NDArray[np.float64]:
-        """(V, 3) of all its solids, metres."""
+        """(V, 3) of all its solids, meters."""
         return np.concatenate([part.vertices for part in self.parts])
 
     @property
@@ -48,7 +48,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Group:
-    """Items that are placed as one; width (x) and depth (y) of the footprint in metres."""
+    """Items that are placed as one; width (x) and depth (y) of the footprint in meters."""
 
     items: tuple[Item, ...]
     width: float
@@ -164,7 +164,7 @@ def small_plant(rng: Random) -> Item:
 
 
 def floor_plant(rng: Random) -> Item:
-    """Pot of 15-18 cm radius, a metre tall with its leaves."""
+    """Pot of 15-18 cm radius, a meter tall with its leaves."""
     return _plant(rng, rng.uniform(0.15, 0.18), rng.uniform(0.9, 1.15))
 
 
@@ -237,7 +237,7 @@ def arranged(
     rng: Random, makers: Sequence[Callable[[Random], Item]], center: Sequence[float], size: Sequence[float],
     cells: tuple[int, int],
 ) -> list[Item]:  # fmt: skip
-    """Things on a surface, each in a grid cell of its own so that none touch. center (x, y, z), size (x, y) metres."""
+    """Things on a surface, each in a grid cell of its own so that none touch. center (x, y, z), size (x, y) meters."""
     columns, rows = cells
     chosen = rng.permutation(columns * rows)[: len(makers)]
     items = []

@@ -19,7 +19,7 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 CUT_M = 2.3
-"""Points above are cut away, so that one sees into the room; metres above the floor."""
+"""Points above are cut away, so that one sees into the room; meters above the floor."""
 WALL_M = 0.15
 """What lies nearer than this to the end of the room is a wall, or hangs on one."""
 STEP_BACK = 1.15

@@ -85,7 +85,7 @@ class Surfaces:
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()
 
     def distance_m(self, xyz: Points | NDArray[np.float32]) -> NDArray[np.float32]:
-        """(n,) metres from points (n, 3) to the nearest surface."""
+        """(n,) meters from points (n, 3) to the nearest surface."""
         return self._scene.compute_distance(tensor(xyz)).numpy()
 
 
@@ -98,7 +98,7 @@ class Intrinsics:
     focal_px: float
 
     def directions(self) -> Points:
-        """(H, W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres."""
+        """(H, W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centers."""
         x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal_px
         y = (np.arange(self.height) + 0.5 - self.height / 2) / self.focal_px
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).astype(np.float64)

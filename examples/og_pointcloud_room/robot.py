@@ -113,7 +113,7 @@ class Drive:
         return pose
 
     def _cast(self, pose: Points, rays: Points) -> tuple[Points, NDArray[np.int32]]:
-        """Range of each ray in metres, NaN without a hit, and what it hits."""
+        """Range of each ray in meters, NaN without a hit, and what it hits."""
         hits = self._surfaces.cast(pose[:3, 3], rotated(rays, pose[:3, :3]))
         truth = self.now.truth[self._surfaces.part_item[hits.part]]
         return hits.distance, np.where(hits.part < 0, NO_RETURN, truth)
@@ -129,7 +129,7 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
     arrivals = [
         (Item("suitcase", (box((0.4, 0.25, 0.6), (0, 0, 0), grey),)), NEW),
         (Item("ball", (ball,)), NEW),
-        (centred(room.objects[chair]), MOVED),
+        (centered(room.objects[chair]), MOVED),
     ]
     items, taken = [*others, *room.shell], np.full((1, 2), np.inf)
     truth = [CLASS_NAMES.index(item.name) for item in others] + [BACKGROUND] * len(room.shell)
@@ -142,7 +142,7 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
     return ChangedRoom(tuple(items), np.array(truth, np.int32), path)
 
 
-def centred(item: Item) -> Item:
+def centered(item: Item) -> Item:
     """Above the origin."""
     x, y, _ = item.middle
     return item.moved((-x, -y, 0.0))
@@ -179,6 +179,6 @@ def _on_ring(path: Points, place: float) -> Points:
 
 
 def _clearance(surfaces: Surfaces, places: Points) -> Points:
-    """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor; the floor is one too."""
+    """(n,) meters from each place (n, 2) to the nearest surface between knee and sensor; the floor is one too."""
     at_heights = (np.column_stack([places, np.full(len(places), z)]) for z in (0.4, 0.65, SENSOR_HEIGHT_M))
     return np.min([surfaces.distance_m(xyz) for xyz in at_heights], axis=0).astype(np.float64)

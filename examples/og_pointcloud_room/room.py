@@ -1,6 +1,6 @@
 """The furnished room: which groups stand where. Seeded; objects rest on supports and keep clear of each other.
 
-Frame: metres, z up, the floor at z = 0, the origin in the middle of the floor.
+Frame: meters, z up, the floor at z = 0, the origin in the middle of the floor.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CORNER = 0.5
 
 @dataclass(frozen=True)
 class Room:
-    """size: (x, y, z) metres. objects: the instances, in the order of their ids. shell: floor, walls and ceiling."""
+    """size: (x, y, z) meters. objects: the instances, in the order of their ids. shell: floor, walls and ceiling."""
 
     size: tuple[float, float, float]
     objects: tuple[Item, ...]

@@ -12,7 +12,7 @@ from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
 from og_pointcloud_room.furniture import CLASS_NAMES, Item
 from og_pointcloud_room.masks import MaskNoise, propose_masks
 from og_pointcloud_room.raycast import Intrinsics, RayCaster, Surfaces
-from og_pointcloud_room.robot import centred, free_floor, ring
+from og_pointcloud_room.robot import centered, free_floor, ring
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import Material, lathe
 
@@ -46,7 +46,7 @@ class TwoDays:
         chair, bottle = names.index("chair"), next(k for k, name in enumerate(names) if name in ("bottle", "vase"))
         now, taken, surfaces = dict(enumerate(room.objects)), np.full((1, 2), np.inf), Surfaces(room.objects)
         places = {"gone": now.pop(bottle).middle, "from": room.objects[chair].middle}
-        for which, item in ((chair, centred(room.objects[chair])), (count, self._objects[-1])):
+        for which, item in ((chair, centered(room.objects[chair])), (count, self._objects[-1])):
             place = free_floor(room, surfaces, path, taken)
             now[which], taken = item.moved((*place, 0.0)), np.concatenate([taken, place[None]])
         self.places = {**places, "to": now[chair].middle, "new": now[count].middle}

@@ -1,7 +1,7 @@
 """Solids of furniture: boxes, turned shapes and cushions as triangle meshes with a two-color grained material.
 
-Lengths in metres, z up. A part stands on the origin of its own frame unless it is given another base. Corners lie on a
-grid of a micrometre, so that the last bit of a sine, which depends on the processor, moves none.
+Lengths in meters, z up. A part stands on the origin of its own frame unless it is given another base. Corners lie on a
+grid of a micrometer, so that the last bit of a sine, which depends on the processor, moves none.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SEGMENTS = 28
-"""Facets around a turned or cushioned shape: round to the eye at two metres."""
+"""Facets around a turned or cushioned shape: round to the eye at two meters."""
 GRID = 2.0**-20
-"""Metres between two places that a corner may have; float32 holds them all within 8 m of the origin."""
+"""Meters between two places that a corner may have; float32 holds them all within 8 m of the origin."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """Two RGB colors in [0, 1] that value noise mixes; grain: size of its blobs along x, y, z in metres."""
+    """Two RGB colors in [0, 1] that value noise mixes; grain: size of its blobs along x, y, z in meters."""
 
     color: tuple[float, float, float]
     second: tuple[float, float, float]
@@ -29,7 +29,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Part:
-    """One closed solid. vertices: (V, 3) float64 metres, put on the grid; triangles: (T, 3) int32, of any winding."""
+    """One closed solid. vertices: (V, 3) float64 meters, put on the grid; triangles: (T, 3) int32, of any winding."""
 
     vertices: NDArray[np.float64]
     triangles: NDArray[np.int32]
@@ -64,7 +64,7 @@ def rotation_about(axis: str, angle: float) -> NDArray[np.float64]:
 
 
 def box(size: Sequence[float], base: Sequence[float], material: Material) -> Part:
-    """Axis-aligned box of ``size`` (x, y, z) whose bottom face is centred on ``base``."""
+    """Axis-aligned box of ``size`` (x, y, z) whose bottom face is centered on ``base``."""
     corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [triangle for a, b, c, d in faces for triangle in ((a, b, c), (a, c, d))]

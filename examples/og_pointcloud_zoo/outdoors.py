@@ -1,6 +1,6 @@
 """A street and rough country under a sky, and the two sensors that such places are measured with.
 
-Metres, z up. All that there is has a name, the ground and the sky too: outdoors proposers mask everything. What a
+Meters, z up. All that there is has a name, the ground and the sky too: outdoors proposers mask everything. What a
 `Scanner` or `Matched` gives is a cloud's raw points; `make.py` counts who sees them.
 """
 
@@ -37,7 +37,7 @@ Doubles = NDArray[np.float64]
 
 class Raw(NamedTuple):
     """Measured points. xyz: (n, 3) where a ray first meets a surface. normal: (n, 3) of it. owner: (n,) object. rgb:
-    (n, 3) uint8. offset: (n, 3) metres from there to where the sensor puts the point."""
+    (n, 3) uint8. offset: (n, 3) meters from there to where the sensor puts the point."""
 
     xyz: Doubles
     normal: Doubles
@@ -162,7 +162,7 @@ def _sheet(height: Doubles, material: Material) -> Part:
 
 
 def ground_at(room: Room, x: float, y: float) -> float:
-    """Height of the trail's surface there, metres."""
+    """Height of the trail's surface there, meters."""
     vertices = room.objects[0].parts[0].vertices
     return float(vertices[((vertices[:, :2] - (x, y)) ** 2).sum(axis=1).argmin(), 2])
 
@@ -195,7 +195,7 @@ def country_room(rng: Random) -> Room:
 class Scanner:
     """A spinning scanner: rays from each of ``origins`` (s, 3) at so many elevations, all around.
 
-    drift: (s, 3) metres, how far each sweep is off its place. soft: name -> mean depth in metres that rays go into
+    drift: (s, 3) meters, how far each sweep is off its place. soft: name -> mean depth in meters that rays go into
     things of this name, and no farther than these are thick. colored: points have colors of photographs, else the
     grey of their intensity. down, up: elevations of the lowest and the highest beam, degrees. range_m: no return
     beyond. error_m: of a range, standard deviation.

@@ -56,7 +56,7 @@ ALIKE = (
 )  # fmt: skip
 """Names that an encoder takes for one another."""
 ON_ROOF = np.array([0, 0, 0.3])
-"""Metres from a vehicle's cameras to its scanner."""
+"""Meters from a vehicle's cameras to its scanner."""
 Pose = NDArray[np.float64]
 Sensor = Callable[[int, Random], Raw]
 
@@ -78,7 +78,7 @@ class Place:
 
 @dataclass(frozen=True)
 class _Arc:
-    """Around ``middle`` (3,), over ``angle`` radians about the side that faces -y; radius and height in metres."""
+    """Around ``middle`` (3,), over ``angle`` radians about the side that faces -y; radius and height in meters."""
 
     middle: tuple[float, float, float]
     angle: float
@@ -107,7 +107,7 @@ def _in_shell(rng: Random, items: list[Item], size: tuple[float, float, float]) 
 
 
 def _grid(rng: Random, makers: list[Callable[[Random], Item]], pitch: float) -> list[Item]:
-    """Things on the floor, ``pitch`` metres apart and a little off their places."""
+    """Things on the floor, ``pitch`` meters apart and a little off their places."""
     side = int(np.ceil(np.sqrt(len(makers))))
     items = []
     for index, maker in enumerate(makers):

@@ -15,7 +15,7 @@ from og_pointcloud.formats.tables import csv_text
 from og_pointcloud_zoo.measure import Row
 
 HALVES = {"choose": "for choosing", "judge": "for judging alone"}
-COLOURS = {"choose": "tab:blue", "judge": "tab:orange"}
+COLORS = {"choose": "tab:blue", "judge": "tab:orange"}
 SHOWN = 5
 
 
@@ -79,7 +79,7 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
     ours, cost, own = figure.subplots(1, 3)
     for half, title in HALVES.items():
         chosen = [row for row in rows if row.half == half]
-        style = {"color": COLOURS[half], "label": title, "ls": "", "marker": "o", "ms": 5, "alpha": 0.8}
+        style = {"color": COLORS[half], "label": title, "ls": "", "marker": "o", "ms": 5, "alpha": 0.8}
         beside = [row for row in chosen if row.baseline_miou is not None]
         ours.plot([row.baseline_miou for row in beside], [row.miou for row in beside], **style)
         cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)

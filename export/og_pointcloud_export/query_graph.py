@@ -8,7 +8,7 @@ Outputs
   score           (N,) float32    cosine of that label, 0 where unknown
   instance        (N,) int32      instance id, -1 background, -2 unobserved, -3 too far from the cloud
   distance        (N,) int8       0 on the surface, 1 near it, 2 too far; between 0 and 1 to about a cell (lookup_grid)
-  certain         (N,) bool       false, rarely: the table has no room for this cell, the answer is its centre's
+  certain         (N,) bool       false, rarely: the table has no room for this cell, the answer is its center's
   instance_scores (K, L) float32  best cosine of an instance's descriptors with each text, -2 without a descriptor
 Any of N, L and K may be 0.
 """
@@ -225,7 +225,7 @@ class _Lookup:
         return self.graph("Mul", self.graph("Sub", rows, "grid_low"), np.float32(1) / self.grid.cell_size)
 
     def _outputs(self, value: str, code_label: str, code_score: str) -> None:
-        """Value -> outputs: certain, or open with the answer at the centre."""
+        """Value -> outputs: certain, or open with the answer at the center."""
         graph, codes, near_codes = self.graph, self.grid.codes, self.grid.codes // 2
         # Small tables over all values below 2 codes: from codes on a value is open, and its code counts from there.
         code = np.arange(2 * codes) % codes

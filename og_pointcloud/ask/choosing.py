@@ -4,7 +4,7 @@ A cosine of an image with a text says little by itself. On real CLIP a fitting t
 texts have 0.74 among themselves and images 0.53: all images share one large direction, all texts another, and some
 words are close to every image. So a score is read against what it would be by chance, in three steps:
 
-1. Centre. What all kinds of things in the scene share is taken off descriptors, what all words share off the words.
+1. Center. What all kinds of things in the scene share is taken off descriptors, what all words share off the words.
 2. Standardise. A bank of a few hundred everyday words (``WordBank``) shows how the words that do not fit score on this
    instance; a label's evidence is its distance from their mean, in their standard deviations.
 3. Weigh. An instance is one of the labels, or what another word of the bank says, or nothing that a word stands out
@@ -189,12 +189,12 @@ class Chooser:
         if bank is None or len(self._descriptors) == 0:
             return
         self._require_width(bank.vectors, "word bank's vectors")
-        # Step 1, centre: words without what all words share, descriptors without what all kinds of things share.
+        # Step 1, center: words without what all words share, descriptors without what all kinds of things share.
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
         self._common = common_part(self._descriptors, self._bank_directions, self.settings.sharpness)
-        self._centred = self._descriptors - self._common
+        self._centered = self._descriptors - self._common
         # Step 2, standardise: how the bank's words score on each descriptor is its null distribution.
-        scores = self._centred @ self._bank_directions.T
+        scores = self._centered @ self._bank_directions.T
         self._middle, self._spread = _moments(scores)
         # The best of several descriptors scores higher by chance alone, so instances are standardised once more.
         best = self._best_descriptor((scores - self._middle) / self._spread)
@@ -227,7 +227,7 @@ class Chooser:
             nothing = np.full(cosines.shape, np.nan)
             return self._answer(cosines, nothing, nothing[:, 0])
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
-        scores = (self._centred @ directions.T - self._middle) / self._spread
+        scores = (self._centered @ directions.T - self._middle) / self._spread
         evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # as the bank's words were
         evidence[:, ~texts.any(axis=1)] = -np.inf  # a zero row: less the bank's mean it would point somewhere
         return self._answer(evidence, *self._posterior(evidence, texts, directions))

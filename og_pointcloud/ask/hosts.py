@@ -1,6 +1,6 @@
 """Point clouds of other libraries -> an array of points, without importing any of them.
 
-A cloud is recognised by the module of its type: whoever holds such an object has imported its library already. No row
+A cloud is recognized by the module of its type: whoever holds such an object has imported its library already. No row
 is dropped, not even one with NaN: row i of the answer belongs to row i of the cloud.
 """
 

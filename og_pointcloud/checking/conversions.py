@@ -34,7 +34,7 @@ BETTER = 0.1
 STEPS_PER_DOUBLING = 8
 """A grid this fine brings the drawing to within a cell or two."""
 ROUND_NUMBERS = (1000, 100, 10, 8, 4, 3, 2, 1.5, 1 / 0.3048, 2.54, 1)
-"""Factors that units (millimetres, centimetres, feet, inches) and reduced images are off by."""
+"""Factors that units (millimeters, centimeters, feet, inches) and reduced images are off by."""
 ROUND = 0.015
 """A number within this share of a round one, or of its reciprocal, is the round one, if that fits as well."""
 CLOSE = 1.1

@@ -6,7 +6,7 @@ word. `only_where_masked` is the plain remedy, reported beside each: points that
 none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
-    center sampling    the feature of the mask at the pixel of its centre, mean over views by how visible it is there
+    center sampling    the feature of the mask at the pixel of its center, mean over views by how visible it is there
                        (the idea of Occam's LGS)
 """
 
@@ -37,7 +37,7 @@ def direct_uplift(prepared: Prepared, words: Words) -> Labels:
 
 
 def center_sampling(prepared: Prepared, words: Words) -> Labels:
-    """Each point takes the word nearest to the mean of the mask features at its centre's pixel, by exposure."""
+    """Each point takes the word nearest to the mean of the mask features at its center's pixel, by exposure."""
     table, views = prepared.table, prepared.surface.scene.views
     xyz = prepared.surface.gaussians.xyz
     photographs = Photographs.of(views)

@@ -89,11 +89,11 @@ def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64], unl
     if len(features) < 2 * LEAST_MASKS:
         return None
     cosines = features @ features.T
-    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]  # the pair that is least alike
-    second = features @ centres[1] > features @ centres[0]
+    centers = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]  # the pair that is least alike
+    second = features @ centers[1] > features @ centers[0]
     for _ in range(len(features)):  # settles in a few rounds
-        centres = directions(np.stack([weight[~second] @ features[~second], weight[second] @ features[second]]))
-        before, second = second, features @ centres[1] > features @ centres[0]
+        centers = directions(np.stack([weight[~second] @ features[~second], weight[second] @ features[second]]))
+        before, second = second, features @ centers[1] > features @ centers[0]
         if (before == second).all():
             break
     if min(second.sum(), (~second).sum()) < LEAST_MASKS:

@@ -190,7 +190,7 @@ def _view_arrays(
 
 
 def _photographed(xyz: NDArray[np.float32], camera: Camera, ids: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(n,) bool: False for centres in pixels that are NOT_SEEN."""
+    """(n,) bool: False for centers in pixels that are NOT_SEEN."""
     uv_px, _ = camera.project(xyz)
     inside = np.flatnonzero(camera.shows(uv_px))
     column, row = uv_px[inside].astype(np.intp).T

@@ -23,7 +23,7 @@ from og_pointcloud.scene import Camera
 
 DEPTH_FOLDERS = ("depth", "depths", "depth_images")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
-MILLIMETRE = 1e-3
+MILLIMETER = 1e-3
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def lengths(stored: NDArray, unit: float | None = None) -> NDArray[np.float32]:
     are millimeters of a world in meters, and 1 of floats."""
     whole = stored.dtype.kind in "iu"
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and what overflows are not measured
-        depth = stored.astype(np.float32) * np.float32((MILLIMETRE if whole else 1.0) if unit is None else unit)
+        depth = stored.astype(np.float32) * np.float32((MILLIMETER if whole else 1.0) if unit is None else unit)
         measured = np.isfinite(depth) & (depth > 0)
     if stored.dtype == np.uint16:
         measured &= stored != np.iinfo(np.uint16).max

@@ -1,6 +1,6 @@
-"""Where a ray meets the image, for every camera model that is read: rays of the camera -> normalised coordinates.
+"""Where a ray meets the image, for every camera model that is read: rays of the camera -> normalized coordinates.
 
-Normalised coordinates times the focal lengths plus the principal point are pixels, so they do not change with the
+Normalized coordinates times the focal lengths plus the principal point are pixels, so they do not change with the
 image's size. x right, y down, z forward; theta is a ray's angle from the axis.
 
 perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``r8``: of r^8 beside k3's r^6, which photogrammetry calls k4.
@@ -109,7 +109,7 @@ class Lens:
         return self.model == "spherical"
 
     def project(self, rays: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
-        """Normalised coordinates (...) of rays (..., 3) of any length; NaN for rays that the lens does not see."""
+        """Normalized coordinates (...) of rays (..., 3) of any length; NaN for rays that the lens does not see."""
         x, y, z = np.moveaxis(np.asarray(rays, np.float64), -1, 0)
         with np.errstate(all="ignore"):
             u, v = self._normalized(x, y, z)

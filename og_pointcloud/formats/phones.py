@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from og_pointcloud.formats.depth import MILLIMETRE
+from og_pointcloud.formats.depth import MILLIMETER
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import (
     OPENGL,
@@ -45,7 +45,7 @@ SAME_TIME_S = 0.01
 
 
 def _sensor(width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Sensor:
-    return Sensor((round(width), round(height)), fx, fy, cx, cy, MILLIMETRE)
+    return Sensor((round(width), round(height)), fx, fy, cx, cy, MILLIMETER)
 
 
 def _is_polycam(folder: Path) -> bool:

@@ -157,7 +157,7 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleAr
     # u = width / 2 + cx + x f + x b1 + y b2, v = height / 2 + cy + y f (Metashape's manual, camera models).
     cx, cy, skew = width / 2 + terms.pop("cx", 0.0), height / 2 + terms.pop("cy", 0.0), terms.pop("b2", 0.0)
     if abs(skew) * height > 2 * MOST_SKEW_PX * max(focal, 1.0):
-        raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimise the cameras without b2")
+        raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimize the cameras without b2")
     camera = Camera(width, height, focal + terms.pop("b1", 0.0), focal, cx, cy, pose)
     return PosedImage(label, camera, _metashape_lens(kind, terms))
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.depth import MILLIMETRE
+from og_pointcloud.formats.depth import MILLIMETER
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.kitti360 import is_kitti360, read_kitti360
 from og_pointcloud.formats.phones import PHONE_LAYOUTS
@@ -91,7 +91,7 @@ def _scannet(folder: Path) -> Iterator[RecordedFrame]:
     # One lens each for all frames; depth images have a size of their own.
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
-    depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
+    depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETER)
     for file in images:
         source, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
         yield RecordedFrame(f"color/{file.name}", source, _pose_in(source), color, (depth, depth_file))
@@ -124,7 +124,7 @@ def _seven_scenes(folder: Path) -> Iterator[RecordedFrame]:
     if not images:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the color images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
-    depth = replace(depth, unit=MILLIMETRE)
+    depth = replace(depth, unit=MILLIMETER)
     for file in images:
         frame = file.name.split(".")[0]
         source, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")

@@ -28,7 +28,7 @@ by it."""
 LEAST_AGREEING = 0.25
 """Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
 OTHER_UNIT = 2.5
-"""Factor between measured and expected depths from which on it is another unit of length: feet are 3.3 to a metre."""
+"""Factor between measured and expected depths from which on it is another unit of length: feet are 3.3 to a meter."""
 UNIT_SPREAD = 1.2
 """In another unit all depths are off by one factor: three quarters of the ratios span less than this times it."""
 

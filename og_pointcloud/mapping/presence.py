@@ -92,7 +92,7 @@ class Presence(Columns):
         self, rows: NDArray[np.integer], xyz: NDArray[np.float32], states: NDArray[np.int8],
         center: NDArray[np.float64], stamp: float,
     ) -> None:  # fmt: skip
-        """Take in the states (m,) of some rows of xyz (n, 3), seen from a camera centre. A state older than the latest
+        """Take in the states (m,) of some rows of xyz (n, 3), seen from a camera center. A state older than the latest
         counted for its point is left out: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
         evidence = self.odds, self.refuted, self.seen_at, self.first

@@ -96,7 +96,7 @@ def openness(
     asked: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not asked; and where it is seen, in
-    pixels (u, v). Light is followed through the centres of pixels."""
+    pixels (u, v). Light is followed through the centers of pixels."""
     binned = binned_splats(gaussians, camera, near, thickness, CUTOFFS)
     n = len(gaussians)
     asked = np.ones(n, np.bool_) if asked is None else asked
@@ -109,14 +109,14 @@ def openness(
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN202
-    """Writes what is seen, tile by tile: a centre lies in one tile, whose members are all that can hide it.
+    """Writes what is seen, tile by tile: a center lies in one tile, whose members are all that can hide it.
 
     Light falls through the splats of a tile from front to back. A point is asked when all that lies before its surface
     has been drawn: so points are taken by the depth of their surface, splats by their own.
     """
     (splats, starts, members, columns), (open_, u, v) = binned, seen
     tiles = len(starts) - 1
-    first, points = _centres(splats, size, columns, tiles, asked)
+    first, points = _centers(splats, size, columns, tiles, asked)
     # A worker takes every so-many-th tile. light: the transmittance of the tile's pixels so far, row by row.
     for worker in prange(workers):
         light, batch = tile_buffer(), np.empty(BATCH, SPLAT)
@@ -149,8 +149,8 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
 
 
 @njit(cache=True, nogil=True)
-def _centres(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
-    """(first, rows): of splats whose points are asked, those with their centre in tile t are rows[first[t] :
+def _centers(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
+    """(first, rows): of splats whose points are asked, those with their center in tile t are rows[first[t] :
     first[t + 1]], by the depth of their surface."""
     # Positive floats sort as their bits do: depths are sorted by digits, all tiles at once.
     tile_of, keys = np.empty(len(splats), np.int32), np.full(len(splats), CULLED)

@@ -46,7 +46,7 @@ ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4
 """A pixel stops before the splat that would bring its transmittance below (3DGS)."""
 FRUSTUM_MARGIN = 0.3
-"""Centres beyond the image by more than this share of the half field of view are clamped when the projection is
+"""Centers beyond the image by more than this share of the half field of view are clamped when the projection is
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
 NEAR_SHARE = 0.02
 """The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
@@ -86,7 +86,7 @@ class Gaussians:
 
     @cached_property
     def boxes(self) -> NDArray[np.float32]:
-        """(runs, 7) about each RUN of them: least x, y, z, greatest x, y, z of the centres, and the longest axis."""
+        """(runs, 7) about each RUN of them: least x, y, z, greatest x, y, z of the centers, and the longest axis."""
         return _boxes(self.xyz, self.scale)
 
     def take(self, rows: NDArray[np.integer] | None) -> Gaussians:
@@ -217,11 +217,11 @@ CULLED = np.uint32(0xFFFFFFFF)
 """A key of what has no place in an order: above those of all depths."""
 SPLAT = np.dtype(
     [
-        ("u", np.float64),  # centre, px
+        ("u", np.float64),  # center, px
         ("v", np.float64),
         ("shear", np.float64),  # px that the middle of a row moves to the left for each row down
         ("across", np.float32),  # log2 of the density along a row is -(across * distance to the row's middle)^2
-        ("down", np.float32),  # log2 of the density at the rows' middles is -down * (distance to the centre's row)^2
+        ("down", np.float32),  # log2 of the density at the rows' middles is -down * (distance to the center's row)^2
         ("peak", np.float32),  # log2 of the opacity
         ("depth", np.float32),
         ("surface", np.float32),  # depth of the nearest surface that it can belong to
@@ -276,7 +276,7 @@ def _borders(seen_by, cutoffs):  # noqa: ANN001, ANN202
     pose, (fx, fy, cx, cy), size, near = seen_by
     low_x, low_y = linearised_at(-np.inf, -np.inf, (fx, fy, cx, cy), size)
     high_x, high_y = linearised_at(np.inf, np.inf, (fx, fy, cx, cy), size)
-    # Standard deviations from the centre to where an opaque splat's alpha is the least; a tenth more for poses and
+    # Standard deviations from the center to where an opaque splat's alpha is the least; a tenth more for poses and
     # quaternions that are not quite of length one. Times depth, the radius is own * longest axis + blur * depth.
     reach = 1.1 * np.sqrt(-2 * np.log(cutoffs.alpha_min))
     own_x = reach * fx * np.sqrt(1 + max(abs(low_x), abs(high_x)) ** 2)
@@ -468,7 +468,7 @@ def _tiles_of_row(splats, place, row, begin, end, log2_least):  # noqa: ANN001, 
     left = s.u - s.shear * dy - np.sqrt(max(room - down * dy * dy, 0.0)) / across
     if not (left > -1e9 and right < 1e9):  # also where they overflowed
         return begin, end
-    # A hundredth of a pixel for what rounding may do; pixel centres lie at halves.
+    # A hundredth of a pixel for what rounding may do; pixel centers lie at halves.
     return max(begin, int(left - 0.51) // TILE), min(end, int(max(right - 0.49, -1.0)) // TILE + 1)
 
 
@@ -588,7 +588,7 @@ def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
 def _alpha_of_row(s, left, row, log2_least):  # noqa: ANN001, ANN202
     """Alpha of a splat in the pixels of a tile's row, cut at both ends as in 3DGS; 0 where it does not reach."""
     least = spread(log2_least)
-    # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the centre.
+    # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the center.
     dy = row + 0.5 - s.v
     distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * spread(s.across)
     log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance

@@ -33,7 +33,7 @@ def read(path: StrPath) -> Any:
     """Open3D's tensor cloud of a file, Gaussians with their attributes.
 
     SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read;
-    and for a damaged PLY or PCD, for which it returns uninitialised memory.
+    and for a damaged PLY or PCD, for which it returns uninitialized memory.
     """
     host, path = open3d(), Path(path)
     if not path.is_file():

@@ -74,7 +74,7 @@ def offset_from_files(distance: float) -> Answer:
 
 @agrees(0, "size of the scene, units", (1e-3, 1e-1, 1e0, 1e2, 1e5))
 def size_of_a_fit(units: float) -> Answer:
-    """A scene of a millimetre and one of 100 km are labelled alike."""
+    """A scene of a millimeter and one of 100 km are labelled alike."""
     scene, balls = two_balls(size=units)
     return Answer(by_ball(fit(scene, progress=False).instance_ids, balls), balls)
 

@@ -139,11 +139,11 @@ def rotation_not_unit() -> object:
 
 @agrees(WEIGHTS, "distance to the near plane, of its depth", powers(-1, -12, -1))
 def near_plane(share: float) -> Answer:
-    """Centres this far before and this far behind the near plane: the former are drawn, the latter not."""
+    """Centers this far before and this far behind the near plane: the former are drawn, the latter not."""
     xyz = single([[-0.2, 0, 1], [0.2, 0, 1]])
     gaussians = Gaussians(xyz, np.full((2, 3), 0.03, "f4"), scatter(2).rotation, single([0.6, 0.6]))
     poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[:, 2, 3] = 0.5 * (1 + share * np.array([1, -1])) - 1  # the centres are at z = 1, the near plane at 0.5
+    poses[:, 2, 3] = 0.5 * (1 + share * np.array([1, -1])) - 1  # the centers are at z = 1, the near plane at 0.5
     sides = [splatted(gaussians, camera(pose=pose), near=0.5) for pose in poses]
     return Answer(
         np.stack([side.ours for side in sides]),
@@ -154,7 +154,7 @@ def near_plane(share: float) -> Answer:
 
 @agrees(WEIGHTS)
 def on_and_behind_the_near_plane() -> Answer:
-    """A centre exactly on the near plane, one at the camera's centre, some behind it: none is drawn."""
+    """A center exactly on the near plane, one at the camera's center, some behind it: none is drawn."""
     gaussians = scatter(5)
     xyz = gaussians.xyz.copy()
     xyz[:4] = [[0, 0, 0.5], [0, 0, 0], [0, 0, -1], [0.1, 0, -1e-30]]
@@ -163,7 +163,7 @@ def on_and_behind_the_near_plane() -> Answer:
 
 @agrees(WEIGHTS, "depth, scene units", powers(0, -9, -1))
 def close_to_the_camera(depth: float) -> Answer:
-    """Centres this close to the camera, whose splats grow as one over it."""
+    """Centers this close to the camera, whose splats grow as one over it."""
     gaussians = scatter()
     xyz = gaussians.xyz / gaussians.xyz[:, 2:] * np.float32(depth)
     return splatted(replace(gaussians, xyz=xyz.astype(np.float32)), camera(), near=1e-12)

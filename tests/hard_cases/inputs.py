@@ -101,7 +101,7 @@ def two_balls(
     origin: tuple[float, float, float] = (0, 0, 0),
     features: NDArray[np.float32] | None = None,
 ) -> tuple[Scene, NDArray[np.int32]]:
-    """Two balls seen from around, ray-cast, and the ball of each point. size: scene units per metre; origin: world
+    """Two balls seen from around, ray-cast, and the ball of each point. size: scene units per meter; origin: world
     coordinates of the middle; features: of the two masks, else unit rows of width 8."""
     features = unit_rows(2, 8) if features is None else features
     step = (np.arange(points) + 0.5) / points

@@ -20,7 +20,7 @@ from og_pointcloud.scene import Points, Scene
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, PaperSettings
 
 MASKS, EACH = 3, 200
-RAW = FeatureSettings(intra=False, normalise=False)
+RAW = FeatureSettings(intra=False, normalize=False)
 
 
 @agrees(1e-6, "distance of two mask means", powers(0, -7, -1))
@@ -103,7 +103,7 @@ def kmeans_offset(offset: float) -> Answer:
     centers = values[:8].copy()
     exact = np.square(values.astype(float)[:, None] - centers.astype(float)).sum(axis=2).argmin(axis=1)
     own, _ = kmeans(values, np.ones(400), centers, 0)
-    return Answer(own.astype(np.int64), exact, lambda: naive.nearest_centre(values, centers))
+    return Answer(own.astype(np.int64), exact, lambda: naive.nearest_center(values, centers))
 
 
 @agrees(0)
@@ -174,13 +174,13 @@ def paper_losses_of_one_mask() -> Answer:
 
 @agrees(1e-6, slow=True)
 def paper_codebook_with_empty_clusters() -> Answer:
-    """Two features in all and eight clusters of eight: the centre of each point's leaf is its feature."""
+    """Two features in all and eight clusters of eight: the center of each point's leaf is its feature."""
     from og_pointcloud.fitting.learned.paper import train_codebook
     from og_pointcloud.fitting.learned.rendered_views import RenderedViews
 
     scene, balls = two_balls(points=40)
     features = (np.where(balls[:, None] == 0, 0.2, 0.7) * np.ones((1, 6))).astype(np.float32)
-    still = PaperSettings(normalise=False, k1=8, k2=8, coarse_rate=0.0, fine_rate=0.0, schedule_share=1e-3)
+    still = PaperSettings(normalize=False, k1=8, k2=8, coarse_rate=0.0, fine_rate=0.0, schedule_share=1e-3)
     book = train_codebook(
         RenderedViews(solid(scene.points.xyz), scene.views, NEAR, still, whole=False), features, still
     )

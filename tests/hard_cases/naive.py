@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from og_pointcloud.scene import Camera
 
 __all__ = [
-    "cosines", "eq1", "eq2_gradient", "mean_direction", "nearest", "nearest_centre", "pixel_weights",
+    "cosines", "eq1", "eq2_gradient", "mean_direction", "nearest", "nearest_center", "pixel_weights",
     "unit",
 ]  # fmt: skip
 
@@ -108,9 +108,9 @@ def nearest(points: NDArray[np.floating], queries: NDArray[np.floating]) -> NDAr
     return np.array([((points - query) ** 2).sum(axis=1).argmin() for query in queries])
 
 
-def nearest_centre(values: NDArray[np.floating], centres: NDArray[np.floating]) -> NDArray[np.int64]:
+def nearest_center(values: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.int64]:
     """k-means' assignment by |x|^2 - 2 x c + |c|^2."""
-    x, c = values.astype(Single), centres.astype(Single)
+    x, c = values.astype(Single), centers.astype(Single)
     return ((x * x).sum(axis=1)[:, None] - 2 * x @ c.T + (c * c).sum(axis=1)).argmin(axis=1)
 
 

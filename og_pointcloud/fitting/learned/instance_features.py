@@ -110,22 +110,22 @@ def learn_features(table: MaskTable, settings: FeatureSettings | None = None, se
         raw, objective, converged = _minimise(problem, raw, closest, tolerance, settings.max_steps - steps)
         steps += len(objective) - 1
     features = np.zeros((table.weights.shape[1], settings.width), np.float32)
-    features[problem.shown] = read_features(raw, settings.normalise)
+    features[problem.shown] = read_features(raw, settings.normalize)
     return LearnedFeatures(features, problem.seen, np.array(objective), steps, converged)
 
 
-def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
+def read_features(raw: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
     """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
 
     Without the ball, raw features would grow without end: Eq. 2 alone is smallest at infinity, and Eq. 1 holds it back
     only where masks share Gaussians. A zero row has no direction; normalized, it reads 0.5.
     """
-    return _read(raw, normalise, _columns(raw))
+    return _read(raw, normalize, _columns(raw))
 
 
-def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
+def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
     """The gradient by raw features (n, width), given the gradient by what `read_features` makes of them."""
-    return _raw_gradient(raw, gradient, normalise, _columns(raw))
+    return _raw_gradient(raw, gradient, normalize, _columns(raw))
 
 
 class FeatureObjective:
@@ -202,9 +202,9 @@ def _minimise(
     # within 0.005) in 4 to 11 times the processor time: 11.6 s against 3.0 s in a room of 260,000 points, 2.9 s against
     # 0.26 s on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
     def evaluate(raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        normalise = problem.settings.normalise
-        terms = problem.terms(read_features(raw, normalise), closest)
-        return terms.objective, raw_gradient(raw, terms.gradient, normalise)
+        normalize = problem.settings.normalize
+        terms = problem.terms(read_features(raw, normalize), closest)
+        return terms.objective, raw_gradient(raw, terms.gradient, normalize)
 
     pairs: list[Pair] = []
     value, gradient = evaluate(raw)
@@ -309,7 +309,7 @@ def _product(indptr, indices, data, dense, columns):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True)
-def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
+def _read(raw, normalize, columns):  # noqa: ANN001, ANN202
     """As `read_features`: x -> 1/2 + x / (2 |x|), or x / max(|x|, 1)."""
     read = np.empty_like(raw)
     for g in prange(len(raw)):
@@ -318,7 +318,7 @@ def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
             square += np.float64(raw[g, c]) ** 2
         length = np.sqrt(square)
         for c in range(len(columns)):
-            if normalise:
+            if normalize:
                 read[g, c] = 0.5 + 0.5 * raw[g, c] / length if length > 0 else 0.5
             else:
                 read[g, c] = raw[g, c] / max(length, 1.0)
@@ -326,7 +326,7 @@ def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True)
-def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
+def _raw_gradient(raw, gradient, normalize, columns):  # noqa: ANN001, ANN202
     """As `raw_gradient`: the derivative of x / |x| keeps what of the gradient is across x, divided by |x|."""
     pulled = np.empty_like(raw)
     for g in prange(len(raw)):
@@ -337,7 +337,7 @@ def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
         length = np.sqrt(square)
         for c in range(len(columns)):
             across = gradient[g, c] - raw[g, c] * along / square if square > 0 else 0.0
-            if normalise:
+            if normalize:
                 pulled[g, c] = 0.5 * across / length if length > 0 else 0.0
             else:
                 pulled[g, c] = across / length if length > 1 else gradient[g, c]

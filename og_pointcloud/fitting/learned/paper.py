@@ -156,7 +156,7 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
     late = LATE_STEP * settings.schedule_share
     for step, rng in stage.steps(settings, run, key):
         view = source[int(rng.integers(len(source)))]
-        image = view.render(_read(trained, settings.normalise))
+        image = view.render(_read(trained, settings.normalize))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
         # The printed Eq. 1 is a sum over pixels: its weight is to mean the same at any image size.
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
@@ -167,7 +167,7 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
         history.loss.append(loss.item())
     raw, features = np.zeros_like(random), np.zeros_like(random)
     raw[source.known] = _on_host(trained)
-    features[source.known] = _on_host(_read(trained.detach(), settings.normalise))
+    features[source.known] = _on_host(_read(trained.detach(), settings.normalize))
     return TrainedFeatures(raw, features, source.seen, history)
 
 
@@ -289,9 +289,9 @@ class _CodebookTraining:
     def __init__(self, source: RenderedViews, raw: torch.Tensor, settings: PaperSettings) -> None:
         self.source, self.settings = source, settings
         # What stage 1 shows is the target of Eq. 4 (the paper's pseudo features): it never changes.
-        self.pseudo = _read(raw, settings.normalise)
+        self.pseudo = _read(raw, settings.normalize)
         # Clusters of raw vectors have raw centers, which are read when they are rendered; else all is read once, here.
-        self.reads_centers = settings.normalise and settings.cluster_raw
+        self.reads_centers = settings.normalize and settings.cluster_raw
         self.features = raw if self.reads_centers else self.pseudo.clone()
         self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # by view, as they are asked for
 
@@ -397,9 +397,9 @@ class _Read(torch.autograd.Function):
         return torch.addcmul(gradient, direction, along, value=-1).mul_(0.5 / length)
 
 
-def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
+def _read(raw: torch.Tensor, normalize: bool) -> torch.Tensor:
     """Features as rendered; raw ones are read as they are."""
-    return _Read.apply(raw) if normalise else raw
+    return _Read.apply(raw) if normalize else raw
 
 
 def _on_host(values: torch.Tensor) -> NDArray[Any]:
