@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import literal
 import numpy as np
 import pytest
-from hard_cases import literal
 from numpy.random import Generator
 from numpy.typing import NDArray
 from test_grouping import ONE, hand_table

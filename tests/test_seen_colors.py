@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import literal
 import numpy as np
 import pytest
-from hard_cases import literal
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.sparse import csr_array

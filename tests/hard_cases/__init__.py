@@ -1,7 +1,7 @@
 """Stiff and extreme cases that any change is compared with: ``make check``.
 
 A family a file: geometry, frames, masks, votes, features, learning, choosing, text, files. Each case is a function that
-makes its input; case.py says how it is judged. literal.py (votes, membership, matching, choosing, losses) and
+makes its input; case.py says how it is judged. tests/literal.py (votes, membership, matching, choosing, losses) and
 tests/reference_splatting.py are the float64 references, naive.py the plain float32 forms. The test suite runs the
 quick part.
 """

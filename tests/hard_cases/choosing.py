@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hard_cases import literal
 from hard_cases.case import Answer, agrees, powers
 from hard_cases.inputs import labelled_cloud, unit_rows
 from og_pointcloud.ask.choosing import Chooser

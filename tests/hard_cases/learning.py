@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hard_cases import literal, naive
+from hard_cases import naive
 from hard_cases.case import Answer, agrees, powers, refuses
 from hard_cases.inputs import NEAR, by_ball, int32, mask_table_of, single, solid, two_balls, unit_rows
 from og_pointcloud.cloud import UNOBSERVED

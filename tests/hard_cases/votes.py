@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from hard_cases import literal
 from hard_cases.case import Answer, agrees, powers
 from hard_cases.inputs import int32, single, unit_rows
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
