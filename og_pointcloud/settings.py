@@ -7,21 +7,18 @@ from __future__ import annotations
 
 import sys
 from dataclasses import MISSING, dataclass, field, fields, replace
-from math import inf
 from numbers import Integral, Real
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from og_pointcloud.errors import OgPointcloudError
 
 ABOVE_ZERO = {
-    "coarse_interval", "crossing", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
+    "coarse_interval", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
     "kinds", "lloyd_rounds", "memory", "neighbors", "opacity", "reach", "rounds", "scale", "scales", "schedule_share",
     "sharpness", "synonym", "tile_points", "width",
 }  # fmt: skip
 """Numbers that 0 would make meaningless; none may be negative."""
 AT_MOST_ONE = {"opacity", "view_quantile"}
-MAY_BE_INFINITE = {"own_vote"}
-"""With infinite votes for its own state, no point is ever outvoted."""
 
 
 class _Checked:
@@ -54,8 +51,7 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
     numbers: Any = Integral if whole else Real
     if isinstance(value, numbers) and not isinstance(value, bool):
         largest = 1 if most else 2**63 - 1 if whole else sys.float_info.max
-        bounded = value <= largest or (value == inf and name in MAY_BE_INFINITE)
-        if bounded and value >= 0 and not (value == 0 and least):
+        if 0 <= value <= largest and not (value == 0 and least):
             return ""
     kind = "a whole number" if whole else "a finite number"
     return kind + (" above 0" if least else " from 0") + " to 1" * most + ", below 2^63" * whole
@@ -111,18 +107,18 @@ class MembershipSettings(_Checked):
     """States of points (membership.py)."""
 
     sure_share: float = 0.6
-    """A point is surely of an instance when this share of the weight asked lies in its masks."""
+    """A point is clearly of an instance when this share of the weight asked lies in its masks."""
     sure_votes: float = 0.1
     """And when this share of all votes on it are for the instance, those of views without a mask of it among them."""
     open_share: float = 0.7
-    """A point that is seen less than this share as openly as the scene's others follows its neighbors, the more so the
-    less openly it is seen."""
+    """Nothing is clear of a point that is seen less than this share as openly as the scene's others, and votes on it
+    count the less, the less openly it is seen."""
     possible_share: float = 0.2
-    """A point may be of an instance from this share on, if it adjoins sure ones."""
+    """A point is clearly of none below this share. From it on it may be of an instance that it adjoins,"""
     possible_openly: float = 0.2
-    """And from this share on where each vote counts by itself once more, so that views that see it openly decide."""
+    """if it has this share too where each vote counts by itself once more, so that views that see it openly decide,"""
     growth_votes: float = 0.25
-    """Such a point becomes one of the instance's when this share of the adjoining points are so already."""
+    """and becomes one of it when this share of the adjoining points, as far as colors say, are so already."""
     rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     missed_chance: float = 0.02
@@ -130,11 +126,6 @@ class MembershipSettings(_Checked):
     island_share: float = 0.15
     """A separate piece whose points show less than this share of what the main piece's do was seen through the main
     piece, and is not part of it."""
-    own_vote: float = 3.0
-    """Votes of a point for its own state; a sure neighbor has one, if colors say nothing of the two."""
-    crossing: float = 2.0
-    """It takes so many times more votes to cross between background and an instance: a background point has so many
-    times the votes for its own state, and to an instance's point background neighbors count so many times less."""
     gap_sizes: float = 0.5
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2

@@ -1,6 +1,7 @@
 """Votes, membership, matching, choosing and losses written straight from their definitions, in float64, in loops.
 
-Slow and short: dense arrays, one point, mask, view or word at a time, nothing shared with the library but its settings.
+Slow and short: dense arrays, one point, mask, view or word at a time, nothing shared with the library but settings and
+numbers.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
 def membership(
     votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbors: list[list[int]],
     settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None,
-) -> tuple[Ids, Array, Array]:  # fmt: skip
-    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbors: of each point, nearest first;
+) -> tuple[Ids, Array]:  # fmt: skip
+    """Ids and certainty of every point. weights: (masks, n) pixels; neighbors: of each point, nearest first;
     rgb: (n, 3)."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
@@ -114,20 +115,20 @@ def membership(
 
     seen = sorted(votes.openness[votes.openness > 0])
     typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
-    hidden = votes.openness < settings.open_share * typical
+    open_ = np.minimum(1, votes.openness / (settings.open_share * typical))
     for_best = np.where(best >= 0, own[best, np.arange(len(points))], 0.0)
     agreed = (best >= 0) & (share > settings.sure_share) & (for_best > settings.sure_votes * total)
-    hearsay = hidden & agreed
-    ids = np.where(agreed & ~hidden, best, BACKGROUND).astype(np.int32)
-
-    def sureness() -> Array:
-        """How much of the votes is for the state of each point."""
-        return np.where(total > 0, np.where((ids == best) & (best >= 0), share, 1 - share), 0)
-
+    clear = np.where(share < settings.possible_share, BACKGROUND, UNOBSERVED)
+    clear = np.where(open_ == 1, np.where(agreed, best, clear), UNOBSERVED).astype(np.int32)
     alike = np.ones((len(points),) * 2)
     if rgb is not None:
+        sureness = np.where((clear == best) & (best >= 0), share, 1 - share) * (clear != UNOBSERVED)
         apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
-        alike = color_ratios(rgb, ids, sureness(), neighbors)[np.rint(apart).astype(int)]
+        alike = color_ratios(rgb, clear, sureness, neighbors)[np.rint(apart).astype(int)]
+    reporting = [k if k in kept else -1 for k in group]
+    likely = _likely_states(votes, mask_view, reporting, count, clear, best, open_, neighbors, alike)
+    ids = np.array([min(of, key=lambda k: (-of[k], k)) if of else UNOBSERVED for of in likely], np.int32)
+    ids[ids == count] = BACKGROUND
     possible = (best >= 0) & (share > settings.possible_share) & (openly > settings.possible_openly)
     while True:  # a middling share counts where it adjoins points that are in already
         beside = [sum(alike[g, other] for other in neighbors[g] if ids[other] == best[g]) for g in points]
@@ -136,21 +137,64 @@ def membership(
         if not joins:
             break
         ids[joins] = best[joins]
-    ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
-    hearsay &= ids == BACKGROUND
-    known = ids.copy()
-    for g in np.flatnonzero(hearsay):  # hearsay counts as its neighbors do, as far as the point is seen openly
-        weight = sum(alike[g, other] for other in neighbors[g])
-        said = {int(best[g]): share[g] * votes.openness[g] / (settings.open_share * typical) * weight}
-        for other in neighbors[g]:
-            if not hearsay[other] and known[other] != UNOBSERVED:
-                said[int(known[other])] = said.get(int(known[other]), 0.0) + alike[g, other]
-        ids[g] = max(said, key=lambda state: said[state])
     ids = _filled(_without_islands(ids, share, weights, group, neighbors, settings.island_share), neighbors)
-    for _ in range(2):
-        ids = _with_neighbors(ids, sureness(), neighbors, alike, settings)
     agreeing = [np.mean([ids[other] == ids[g] for other in neighbors[g]]) if neighbors[g] else 1.0 for g in points]
-    return ids, share, sureness() * agreeing
+    of_state = [likely[g].get(count if ids[g] == BACKGROUND else int(ids[g]), 0.0) for g in points]
+    return ids, np.multiply(of_state, agreeing)
+
+
+def _likely_states(
+    votes: Votes, mask_view: Sequence[int], group: Sequence[int], background: int, clear: Ids, best: Ids, open_: Array,
+    neighbors: list[list[int]], alike: Array,
+) -> list[dict[int, float]]:  # fmt: skip
+    """Of each point, how likely it is in each state that it may be in; the last number is background's."""
+    from og_pointcloud.fitting import view_reports as by  # needs more than a reference of choosing may
+
+    views, points = len(votes.weight), range(len(clear))
+    said = np.zeros((views, background + 1, len(clear)))  # what each view reports of each point; the last: no mask
+    no_group = np.zeros_like(votes.weight)
+    for mask, view in enumerate(mask_view):
+        (said[view, group[mask]] if group[mask] >= 0 else no_group[view])[:] += votes.inside[mask]
+    said[:, background] = np.maximum(votes.weight - no_group - said.sum(axis=1), 0)
+    shown = {(view, k) for view, k in zip(mask_view, group, strict=True) if k >= 0}
+    may: list[set[int]] = []
+    for g in points:
+        near = {int(best[other]) for other in neighbors[g] if best[other] >= 0}
+        in_masks = {k for k in range(background) if said[:, k, g].any()}
+        may.append({*in_masks, *near, background} if votes.weight[:, g].any() else set())
+    likely = [{k: float(k == (background if clear[g] == BACKGROUND else clear[g])) for k in may[g]} for g in points]
+    for _ in range(by.COUNTED):
+        chance = np.zeros((views, background + 1, background + 1))
+        for view, k in np.ndindex(views, background + 1):
+            chance[view, k, k if (view, k) in shown else background] = by.EXPECTED
+            for g in points:
+                sees = said[view, :, g].sum() * open_[g]
+                chance[view, k] += likely[g].get(k, 0) * sees * open_[g] * said[view, :, g]
+            chance[view, k] = (1 - by.LEAST) * chance[view, k] / chance[view, k].sum() + by.LEAST
+        evidence: list[dict[int, float]] = []
+        for g in points:
+            sees, of_point = said[:, :, g].sum(axis=1) * open_[g], {}
+            for k in may[g]:
+                total = 0.0
+                for view in np.flatnonzero(sees):
+                    part = said[view, :, g] / said[view, :, g].sum()
+                    total += part @ np.log(sees[view] * chance[view, k] + (1 - sees[view]) * by.HIDDEN)
+                prior = by.MORE_LIKELY if k == background else 0 if said[:, k, g].any() else -by.UNSEEN
+                of_point[k] = total / max(1, sees.sum() / by.ENOUGH) + prior
+            evidence.append(of_point)
+        likely = [dict.fromkeys(of, 0.0) for of in may]
+        for _ in range(1 + by.ROUNDS):
+            before, likely = likely, []
+            for g in points:
+                heard = {
+                    k: evidence[g][k] + by.SMOOTHNESS * sum(
+                        alike[g, other] * open_[other] * before[other].get(k, 0) for other in neighbors[g]
+                    )
+                    for k in may[g]
+                }  # fmt: skip
+                total = sum(np.exp(value - max(heard.values())) for value in heard.values())
+                likely.append({k: float(np.exp(heard[k] - max(heard.values())) / total) for k in heard})
+    return likely
 
 
 def _filled(ids: NDArray[np.int32], neighbors: list[list[int]]) -> NDArray[np.int32]:
@@ -189,23 +233,6 @@ def _linked(g: int, other: int, piece: set[int], left: set[int], neighbors: list
     if other not in left or other in piece:
         return False
     return any(p in neighbors[other] or other in neighbors[p] for p in piece)
-
-
-def _with_neighbors(
-    ids: Ids, sureness: Array, neighbors: list[list[int]], alike: Array, settings: MembershipSettings
-) -> NDArray[np.int32]:
-    """One round: points take the state that their neighbors are in, by how sure these are."""
-    after = ids.copy()
-    for g in np.flatnonzero(ids != UNOBSERVED):
-        own = settings.own_vote * (settings.crossing if ids[g] == BACKGROUND else 1)
-        votes = {int(ids[g]): own}  # in order of nearness: ties are won by the first
-        for other in neighbors[g]:
-            state = int(ids[other])
-            if state != UNOBSERVED:
-                heard = 1 / settings.crossing if state == BACKGROUND and ids[g] >= 0 else 1
-                votes[state] = votes.get(state, 0.0) + heard * sureness[other] * alike[g, other]
-        after[g] = max(votes, key=lambda state: votes[state])
-    return after
 
 
 def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbors: list[list[int]]) -> Array:

@@ -33,7 +33,7 @@ def trust(*names: str) -> tuple[str, ...]:
     return tuple(f"test_trust.py::test_{name}" for name in names)
 
 
-MEMBERSHIP = hard("votes-borders", "votes-membership_of_any_votes", "votes-certainty_of_any_votes")
+MEMBERSHIP = hard("votes-borders_by_color", "votes-membership_of_any_votes", "votes-certainty_of_any_votes")
 CHOOSING = hard("choosing-nearly_equal_labels", "choosing-label_among_the_bank", "choosing-equal_labels")
 
 MUTATIONS = (
@@ -82,29 +82,41 @@ MUTATIONS = (
         "OPENNESS_POWER = 2", "OPENNESS_POWER = 1", hard("votes-exposure"),
     ),
     Mutation(
-        "border votes whether sure or not", "fitting/membership.py",
-        "support.of_state(ids), around.index", "np.ones(len(ids)), around.index", MEMBERSHIP,
+        "what is hardly seen is believed", "fitting/view_reports.py",
+        "sees, width = counts * openly[g],", "sees, width = counts,", MEMBERSHIP,
     ),
     Mutation(
-        "background heard by instances as instances are", "fitting/membership.py",
-        "vote * of_background if", "vote if", ("test_membership.py",),
+        "reports are counted however little a view sees", "fitting/view_reports.py",
+        "likely[c] * counts * openly[g] ** 2", "likely[c]", MEMBERSHIP,
     ),
     Mutation(
-        "neighbors heard once", "fitting/membership.py",
-        "ROUNDS = 2", "ROUNDS = 1", MEMBERSHIP,
+        "views that look alike add up", "fitting/view_reports.py",
+        "max(1.0, seen / ENOUGH)", "1.0", MEMBERSHIP,
     ),
     Mutation(
-        "points of an instance never become background", "fitting/membership.py",
-        "state < BACKGROUND:", "state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):",
-        (*MEMBERSHIP, "test_membership.py"),
+        "no mask on a point costs nothing", "fitting/view_reports.py",
+        "np.where(found.masked, 0, -UNSEEN)", "np.where(found.masked, 0.0, 0.0)", MEMBERSHIP,
     ),
     Mutation(
-        "neighbors heard whatever their color", "fitting/membership.py",
-        "vote = voice[other] * weights[g, k]", "vote = voice[other]", (*MEMBERSHIP, "test_colors.py"),
+        "background is as likely as any instance", "fitting/view_reports.py",
+        "= MORE_LIKELY", "+= 0.0", MEMBERSHIP,
     ),
     Mutation(
-        "hearsay never believed", "fitting/membership.py",
-        "(share * votes.openness)[hearsay]", "0 * (share * votes.openness)[hearsay]", ("test_membership.py",),
+        "what lies in a mask without a group lies in none", "fitting/view_reports.py",
+        "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)",
+        ("test_membership.py", "test_view_reports.py"),
+    ),
+    Mutation(
+        "neighbors are heard however little is seen of them", "fitting/view_reports.py",
+        "likely[o] * openly[other]", "likely[o]", MEMBERSHIP,
+    ),
+    Mutation(
+        "neighbors are heard whatever their color", "fitting/view_reports.py",
+        "SMOOTHNESS * weights[g, j]", "SMOOTHNESS", (*hard("votes-borders_by_color"), "test_view_reports.py"),
+    ),
+    Mutation(
+        "a part of a scene counts its own reports", "fitting/view_reports.py",
+        "if reports is not None:", "if False:", ("test_view_reports.py",),
     ),
     Mutation(
         "hidden points taken for seen ones", "fitting/seen_colors.py",
@@ -148,11 +160,12 @@ MUTATIONS = (
     ),
     Mutation(
         "what slips past an edge is grown over", "fitting/membership.py",
-        "(support.share_openly > settings.possible_openly)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
+        "(support.share_openly > settings.possible_openly)", "(support.share > 0)", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
-        "one vote of many makes a point sure", "fitting/membership.py",
-        "(support.votes > settings.sure_votes * total)", "(share > 0)", (*MEMBERSHIP, "test_membership.py"),
+        "one vote of many makes a point clear", "fitting/membership.py",
+        "(support.votes > settings.sure_votes * support.total)", "(support.votes > 0)",
+        (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "certainty without the neighbors", "fitting/membership.py",

@@ -355,7 +355,7 @@ def test_pixels_beyond_those_that_mode_paper_renders_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (lambda: MembershipSettings(crossing=0), "crossing is 0; expected a finite number above 0, by default 2.0"),
+        (lambda: GeometrySettings(reach=0), "reach is 0; expected a finite number above 0, by default 3"),
         (lambda: MembershipSettings(gap_sizes=float("nan")), "gap_sizes is nan; expected a finite number from 0, by"),
         (lambda: GeometrySettings(reach=float("inf")), "reach is inf; expected a finite number above 0, by default 3"),
         (lambda: GeometrySettings(scales=()), r"scales is \(\); expected a tuple of numbers above 0"),
@@ -380,7 +380,7 @@ def test_settings_that_mean_nothing_are_refused(settings: Callable[[], object], 
 
 
 def test_a_fit_without_an_instance_says_so() -> None:
-    never = MembershipSettings(sure_share=2.0)  # no share of a point's weight reaches 2
+    never = MembershipSettings(rate_share=2.0)  # no instance is detected twice as often as is typical
     cloud = fit(boxes_on_a_table().scene, FitSettings(membership=never), progress=False)
     assert len(cloud.instances) == 0
     assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])

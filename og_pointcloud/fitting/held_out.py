@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.grouping import group_masks
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
-from og_pointcloud.fitting.membership import SceneVotes, assign_points, views_with_masks
+from og_pointcloud.fitting.membership import assign_by_votes_alone
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
@@ -151,9 +151,4 @@ def _labels(table: MaskTable, around: Neighborhood, settings: FitSettings) -> tu
     are: half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
-    by_votes = replace(
-        settings.membership, sure_votes=0.0, open_share=0.0, own_vote=np.inf, possible_openly=0.0, missed_chance=0.0
-    )
-    votes = view_votes(table)
-    scene = SceneVotes(votes.typical_openness, views_with_masks(table, groups).astype(np.float32))
-    return assign_points(table, votes, groups, around, by_votes, scene=scene).instance_ids, groups.count
+    return assign_by_votes_alone(table, view_votes(table), groups, around, settings.membership), groups.count

@@ -4,43 +4,36 @@ A mask covers a point or it does not; what matters is what the *other* views say
 
     for_k(g)       votes for "in a mask of k" (see `view_votes`)
     possible_k(g)  for_k, and the other votes on g of the views that have a mask of k, each times how complete the masks
-                   of k are there: the part of k's sure points seen in that view that lies in them
+                   of k are there: the part of k's clear points seen in that view that lies in them
     share          for_k / possible_k
 
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
 k", with half a voice if its masks hold but a half of what it sees of k. So a share near 1 means "k", near 0 "seen, and
-not k", however often the proposer misses or splits. Rays that slip past an edge or through a thin surface leave low
-shares on what lies behind, in many views; torn mask edges leave middling shares on the rim of the object itself. The
-two are told apart by place and color: a middling share counts only where the point adjoins surely labelled points of
-the same instance (hysteresis, as in Canny's edges), and in the end every point hears those about it, twice, each as far
-as it is sure and their colors speak for one thing (colors.py).
+not k", however often the proposer misses or splits. A point in masks of several groups is asked of the one with the
+most votes. But proposers let large things swallow small ones: where that group's own views contradict it and a smaller
+one is sure, the smaller one is asked.
 
-What rays slip past is also told from a rim by who sees it well: it is in masks of views that see it badly and outside
-those of views that see it openly, where of a rim all say alike. So a middling share counts only where it stays one when
-each vote counts by itself once more.
+Points whose state is clear from that are those that views see openly and agree on. Where no view sees a point openly,
+all votes on it are hearsay: rays that slip through a surface agree about what lies behind it, and are wrong. What
+counts as openly is measured by the scene's other points: in surfaces of several noisy layers little is seen anywhere.
+The clear points show what each view reports of each instance and of background, and these reports, with neighbors and
+colors, say what every point is likeliest of (view_reports.py).
+
+Torn mask edges leave middling shares on the rim of an object, and views that tear it alike call it background. So do
+rays that slip past an edge on what lies behind. The two are told apart by place and color: a background point with a
+middling share becomes one of the instance where it adjoins points that are (hysteresis, as in Canny's edges). And by
+who sees it well: what rays slip past is in masks of views that see it badly and outside those of views that see it
+openly, where of a rim all say alike. So a middling share counts only where it stays one when each vote counts by
+itself once more.
 
 What one view alone has a mask of, and the others show outside all masks, is a thing only if as many views may well have
 missed one: how often they do, the scene's other groups tell.
-
-A point in masks of several groups gets the one with the most votes. But proposers let large things swallow small ones:
-where that group's own views contradict it and a smaller one is sure, the smaller one gets the point.
-
-Nor is a point sure of an instance that hardly any of its votes are for, though no view that has a mask of the instance
-speaks against it: one ray that slips through would decide.
-
-Where no view sees a point openly, all votes on it are hearsay: rays that slip through a surface agree about what lies
-behind it, and are wrong. Such a point is as its neighbors are, if views know these better, unless it is seen nearly as
-openly as others. What counts as openly is measured by the scene's other points: in surfaces of several noisy layers
-little is seen anywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,42 +46,33 @@ from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.holes import seen_through_holes
 from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
 from og_pointcloud.fitting.memory import scratch_like
-from og_pointcloud.fitting.view_votes import ViewVotes
+from og_pointcloud.fitting.view_reports import ViewReports, likely_states
+from og_pointcloud.fitting.view_votes import ViewVotes, VotesOfPoints, votes_of_points
 from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 from og_pointcloud.rendering.splatting import Gaussians, seen_from
 from og_pointcloud.settings import MembershipSettings
-
-ENTRIES_AT_ONCE = 1 << 26
-"""Entries of the votes that are sorted by point at once: half a gigabyte."""
-ROUNDS = 2
-"""Times that points hear their neighbors: what one round settles, the next hears. Further ones change little."""
-VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
-"""A vote on a point, and the mask or view whose it is: written and read together, they share a line of memory."""
-_ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
-"""(start, votes): the votes on point g are votes[start[g] : start[g + 1]], rows ascending."""
 
 
 @dataclass(frozen=True)
 class SceneVotes:
     """What all votes of a scene say, for points that are a part of it. typical_openness: as of `ViewVotes`.
     completeness: (groups, views) float32 in [0, 1], the part of what a view sees of a group's sure points that lies in
-    its masks of the group; 0 where it has none."""
+    its masks of the group; 0 where it has none. reports: what each view reports of each state."""
 
     typical_openness: float
     completeness: NDArray[np.float32]
+    reports: ViewReports
 
 
 @dataclass(frozen=True)
 class Membership:
-    """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
-    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbors bear out the
-    state that a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the
-    part of a group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that
-    the scene's views contradict as a whole. scene: what all votes said."""
+    """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. certainty: (n,) float32 in [0, 1], how likely views
+    make the state that a point is given, times the part of its neighbors that are in it; 0 where no view sees it.
+    detection_rate: (groups,) float32, the part of a group's visible weight that lies in views that have a mask of it.
+    dismissed: (groups,) bool, groups that the scene's views contradict as a whole. scene: what all votes said."""
 
     instance_ids: NDArray[np.int32]
-    share: NDArray[np.float32]
     certainty: NDArray[np.float32]
     detection_rate: NDArray[np.float32]
     dismissed: NDArray[np.bool_]
@@ -112,43 +96,45 @@ def assign_points(
     has_mask = views_with_masks(table, groups)
     # Points choose twice. As if all masks were complete: that shows which groups are noise, and what is missing in the
     # masks of the others. Then among the others, by masks as complete as they are.
-    of_points = _of_points(votes)
-    of_masks = groups.group, table.mask_view
+    of_points, of_masks = votes_of_points(votes), (groups.group, table.mask_view)
     support = _support(of_points, *of_masks, has_mask.astype(np.float32), np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    if scene is None:
-        scene = SceneVotes(votes.typical_openness, _completeness(votes, *of_masks, has_mask, support))
-    support = _support(of_points, *of_masks, scene.completeness, ~dismissed, settings)
-    del of_points  # the votes sorted by point are as large as the table
-    group, share, total = support.group, support.share, support.total
+    complete = scene.completeness if scene else _completeness(votes, *of_masks, has_mask, support)
+    support = _support(of_points, *of_masks, complete, ~dismissed, settings)
 
-    # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
-    # all that look at a car see the same floor through its roof.
-    agreed = (group >= 0) & (share > settings.sure_share) & (support.votes > settings.sure_votes * total)
-    least_open = settings.open_share * scene.typical_openness
-    hearsay = agreed & (votes.openness < least_open)
-    ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
-    weights = neighbor_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
-    possible = (group >= 0) & (share > settings.possible_share) & (support.share_openly > settings.possible_openly)
-    ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
-    # Of what is known by hearsay alone, neighbors that are known better are asked; it is believed against so many of
-    # them as the point is seen openly.
-    ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
-    hearsay &= ids == BACKGROUND
-    ids[hearsay], own_vote = group[hearsay], np.full(len(ids), np.inf)
-    own_vote[hearsay] = (share * votes.openness)[hearsay] / least_open * weights[hearsay].sum(axis=1)
-    ids = _with_neighbors(ids, 1.0 - hearsay, around.index, weights, own_vote, 1.0)
-    # What is seen through an instance is no part of it; what no view saw is as its neighbors are.
-    ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
-    ids = _fill_unobserved(ids, around)
-    for _ in range(ROUNDS):
-        own_vote = np.where(ids == BACKGROUND, settings.crossing, 1.0) * settings.own_vote
-        ids = _with_neighbors(ids, support.of_state(ids), around.index, weights, own_vote, 1 / settings.crossing)
-    certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
+    typical = scene.typical_openness if scene else votes.typical_openness
+    openly = _openly(votes.openness, settings.open_share * typical)
+    clear = _clear(support, openly, settings)
+    weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
+    of_masks = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group], table.mask_view
+    size = len(has_mask.T), groups.count
+    likely, reports = likely_states(
+        of_points, of_masks, size, clear, support.group, openly, around, weights, scene.reports if scene else None
+    )
+    ids = likely.likeliest(np.full(len(clear), UNOBSERVED, np.int32), groups.count)
+    possible = (support.share > settings.possible_share) & (support.share_openly > settings.possible_openly)
+    ids = _completed(ids, support, possible, (table, groups.group), around, weights, settings)
+    certainty = likely.of(ids, groups.count) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
-        ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32),
-        dismissed, scene,
-    )  # fmt: skip
+        ids, certainty.astype(np.float32), rate.astype(np.float32), dismissed, SceneVotes(typical, complete, reports)
+    )
+
+
+def assign_by_votes_alone(
+    table: MaskTable, votes: ViewVotes, groups: MaskGroups, around: Neighborhood, settings: MembershipSettings
+) -> NDArray[np.int32]:
+    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all masks were
+    complete, and seen openly alike. For a few views of many: they tell nothing of what each of them reports."""
+    has_mask = views_with_masks(table, groups)
+    asked = votes_of_points(votes), groups.group, table.mask_view, has_mask.astype(np.float32)
+    support = _support(*asked, np.ones(groups.count, np.bool_), settings)
+    _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), replace(settings, missed_chance=0.0))
+    support = _support(*asked, ~dismissed, settings)
+    ids = np.where(support.share > settings.sure_share, support.group, BACKGROUND)
+    ids = np.where(support.total > 0, ids, UNOBSERVED).astype(np.int32)
+    weights = around.adjoining.astype(np.float32)
+    possible = support.share > settings.possible_share
+    return _completed(ids, support, possible, (table, groups.group), around, weights, settings)
 
 
 def views_with_masks(table: MaskTable, groups: MaskGroups) -> NDArray[np.bool_]:
@@ -337,29 +323,54 @@ class _Support:
         return self.votes / np.maximum(self.possible, 1e-12)
 
     def of_state(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(n,) in [0, 1]: the part of the possible votes that is for each point's state; 0 where no view sees it."""
+        """(n,) in [0, 1]: the part of the possible votes that is for each point's state; 0 where that is UNOBSERVED."""
         share = np.where((self.group >= 0) & (ids == self.group), self.share, 1 - self.share)
-        return np.where(self.total > 0, np.clip(share, 0, 1), 0)
+        return np.where(ids != UNOBSERVED, np.clip(share, 0, 1), 0)
 
 
-def _of_points(votes: ViewVotes) -> Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]]:
-    """The votes, in masks and all, of so many points at a time that they fit into memory; kept where that is all."""
-    in_mask, vote = votes.in_mask, votes.vote
-    n, runs = in_mask.shape[1], 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
-    bounds = [(n * run // runs, n * (run + 1) // runs) for run in range(runs)]
-    sort = [partial(lambda low, high: (_by_point(in_mask, low, high), _by_point(vote, low, high)), *b) for b in bounds]
-    return sort if runs > 1 else [cache(sort[0])]
+def _openly(openness: NDArray[np.float32], least: float) -> NDArray[np.float32]:
+    """(n,) in [0, 1] how openly points are seen: 1 from an openness of ``least`` on. 0 where no view sees them."""
+    return np.minimum(1, openness / max(least, np.finfo(np.float32).tiny)).astype(np.float32)
+
+
+def _clear(support: _Support, openly: NDArray[np.float32], settings: MembershipSettings) -> NDArray[np.int32]:
+    """(n,) the state of each point that is seen openly and that views agree on; UNOBSERVED of all others.
+
+    Nor is a point clear that hardly any of its votes are for an instance, though no view that has a mask of it speaks
+    against it: one ray that slips through would decide.
+    """
+    ids = np.where(support.share < settings.possible_share, BACKGROUND, UNOBSERVED)
+    agreed = (support.share > settings.sure_share) & (support.votes > settings.sure_votes * support.total)
+    ids = np.where(agreed, support.group, ids)
+    return np.where(openly == 1, ids, UNOBSERVED).astype(np.int32)
+
+
+def _completed(
+    ids: NDArray[np.int32],
+    support: _Support,
+    possible: NDArray[np.bool_],
+    shown: tuple[MaskTable, NDArray[np.int32]],
+    around: Neighborhood,
+    weights: NDArray[np.float32],
+    settings: MembershipSettings,
+) -> NDArray[np.int32]:
+    """The states with what only their place tells: possible points of an instance that adjoin it, pieces that are seen
+    through it, and what no view sees. shown: the mask table, and the group of each mask."""
+    ids = _grow(ids, support.group, possible, around.index, weights, settings.growth_votes)
+    # What is seen through an instance is no part of it; what no view saw is as its neighbors are.
+    ids = _without_islands(ids, support.share, instance_area(*shown, ids), around, settings.island_share)
+    return _fill_unobserved(ids, around)
 
 
 def _support(
-    of_points: Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]],
+    of_points: VotesOfPoints,
     group: NDArray[np.int32],
     mask_view: NDArray[np.int32],
     completeness: NDArray[np.float32],
     allowed: NDArray[np.bool_],
     settings: MembershipSettings,
 ) -> _Support:
-    """The support of all points. of_points: as `_of_points` returns it.
+    """The support of all points.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
     each. completeness: (groups, views), as of `SceneVotes`. allowed: (groups,) those that may be chosen.
@@ -403,28 +414,6 @@ def _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen):  # n
         for e in range(start[view], start[view + 1]):
             if sure[points[e]] >= 0:
                 seen[sure[points[e]], view] += vote[e]
-
-
-def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
-    """Columns low to high of a matrix."""
-    return _columns(matrix.indptr, matrix.indices, matrix.data, low, matrix.shape[1] if high is None else high)
-
-
-@njit(cache=True)
-def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
-    start = np.zeros(high - low + 1, np.int64)
-    for e in range(len(indices)):
-        if low <= indices[e] < high:
-            start[indices[e] - low + 1] += 1
-    start = np.cumsum(start)
-    place, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
-    for row in range(len(indptr) - 1):
-        for e in range(indptr[row], indptr[row + 1]):
-            if low <= indices[e] < high:
-                vote = votes[place[indices[e] - low]]
-                vote["row"], vote["vote"] = row, data[e]
-                place[indices[e] - low] += 1
-    return start, votes
 
 
 @njit(cache=True, parallel=True)
@@ -553,39 +542,6 @@ def _grow(ids, best, possible, neighbors, weights, votes):  # noqa: ANN001, ANN2
                 ids[waiting[i]] = best[waiting[i]]
         waiting = waiting[~joins]
     return ids
-
-
-@njit(cache=True, parallel=True)
-def _with_neighbors(ids, voice, neighbors, weights, own_vote, of_background):  # noqa: ANN001, ANN202
-    """Every point takes the state that most of its adjoining points are in, by their weight and their ``voice``.
-
-    The point's own state has ``own_vote`` votes; to a point of an instance background's votes count ``of_background``.
-    All votes are on the states before (ties: the point's own, then the nearest's).
-    """
-    settled = ids.copy()
-    width = neighbors.shape[1]
-    for g in prange(len(ids)):
-        if ids[g] < BACKGROUND or own_vote[g] == np.inf:
-            continue
-        # The distinct states about the point, its own first, and the votes of each.
-        states = np.empty(width + 1, np.int64)
-        votes = np.empty(width + 1)
-        states[0], votes[0], count = ids[g], own_vote[g], 1
-        for k in range(width):
-            other = neighbors[g, k]
-            state = ids[other]
-            if weights[g, k] == 0 or state < BACKGROUND:
-                continue
-            place = 0
-            while place < count and states[place] != state:
-                place += 1
-            if place == count:
-                states[count], votes[count] = state, 0.0
-                count += 1
-            vote = voice[other] * weights[g, k]
-            votes[place] += vote * of_background if state == BACKGROUND and ids[g] >= 0 else vote
-        settled[g] = states[np.argmax(votes[:count])]
-    return settled
 
 
 @njit(cache=True, parallel=True)

@@ -403,7 +403,9 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     around = neighborhood(cloud.points.xyz[sample], settings.geometry)
-    judged = assign_points(table, votes, groups, around, settings.membership)
+    rgb = cloud.points.rgb
+    rgb = None if rgb is None else rgb[sample]
+    judged = assign_points(table, votes, groups, around, settings.membership, rgb)
     # Groups of which the sample shows no sure point have rate 0: of these the tiles know more.
     dismissed = judged.dismissed & (judged.detection_rate > 0)
     if dismissed.any():

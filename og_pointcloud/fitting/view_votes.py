@@ -12,7 +12,10 @@ view that sees the point best, squared. So
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +27,15 @@ from og_pointcloud.kernels import njit
 
 OPENNESS_POWER = 2
 """Exponent of the relative exposure. 1 believes too much of what shines through, 4 too little of thick surfaces."""
+
+ENTRIES_AT_ONCE = 1 << 26
+"""Entries of the votes that are sorted by point at once: half a gigabyte."""
+VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
+"""A vote on a point, and the mask or view whose it is: written and read together, they share a line of memory."""
+_ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
+"""(start, votes): the votes on point g are votes[start[g] : start[g + 1]], rows ascending."""
+VotesOfPoints = Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]]
+"""Votes in masks, and all of views, of so many points at a time that they fit into memory, points ascending."""
 
 
 @dataclass(frozen=True)
@@ -99,3 +111,34 @@ def _share_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN0
         # Whatever a mask shows its view has exposed: each factor read here was written just above.
         for e in range(first, last):
             in_mask[e] = weight[e] * factor[weight_index[e]]
+
+
+def votes_of_points(votes: ViewVotes) -> VotesOfPoints:
+    """The votes by point; kept where they are all in one part."""
+    in_mask, vote = votes.in_mask, votes.vote
+    n, runs = in_mask.shape[1], 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
+    bounds = [(n * run // runs, n * (run + 1) // runs) for run in range(runs)]
+    sort = [partial(lambda low, high: (_by_point(in_mask, low, high), _by_point(vote, low, high)), *b) for b in bounds]
+    return sort if runs > 1 else [cache(sort[0])]
+
+
+def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
+    """Columns low to high of a matrix."""
+    return _columns(matrix.indptr, matrix.indices, matrix.data, low, matrix.shape[1] if high is None else high)
+
+
+@njit(cache=True)
+def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
+    start = np.zeros(high - low + 1, np.int64)
+    for e in range(len(indices)):
+        if low <= indices[e] < high:
+            start[indices[e] - low + 1] += 1
+    start = np.cumsum(start)
+    place, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
+    for row in range(len(indptr) - 1):
+        for e in range(indptr[row], indptr[row + 1]):
+            if low <= indices[e] < high:
+                vote = votes[place[indices[e] - low]]
+                vote["row"], vote["vote"] = row, data[e]
+                place[indices[e] - low] += 1
+    return start, votes

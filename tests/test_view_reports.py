@@ -1,0 +1,114 @@
+"""What views report of states, and what points are likeliest of by it: points on a line, masks made by hand.
+
+The literal form in float64 is among the hard cases (hard_cases/votes.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_grouping import ONE, OTHER, HandView, hand_table
+from test_membership import decide, groups, on_a_line, torn_case
+
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.fitting import view_votes as votes_module
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.membership import Membership, assign_points
+from og_pointcloud.fitting.view_reports import EXPECTED, LEAST
+from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.rendering.geometry import neighborhood
+from og_pointcloud.settings import GeometrySettings, MembershipSettings
+
+N = 60
+BOOK, SHELF = range(20, 40), [*range(20), *range(40, 60)]
+KNOWS: HandView = [(SHELF, ONE), (BOOK, OTHER)]
+SWALLOWS: HandView = [([*range(38), *range(40, 60)], ONE), (range(38, 40), OTHER)]
+"""All of the book is shelf, but for a scrap with a mask of the book."""
+
+
+def told(
+    table: MaskTable, numbers: Sequence[int], points: slice = slice(None), whole: Membership | None = None,
+    rgb: NDArray[np.uint8] | None = None,
+) -> Membership:  # fmt: skip
+    """Some points of a line, decided by themselves or by what the whole knows."""
+    xyz = on_a_line(table.weights.shape[1])[points]
+    part = table.of_points(np.arange(table.weights.shape[1])[points])
+    around = neighborhood(xyz, GeometrySettings())
+    scene = None if whole is None else whole.scene
+    return assign_points(part, view_votes(part), groups(numbers), around, MembershipSettings(), rgb, scene)
+
+
+def test_a_view_that_calls_the_whole_book_shelf_does_not_count_against_the_book() -> None:
+    """Four views know the book. Three swallow it, and so say nothing of book and shelf."""
+    table = hand_table(N, [KNOWS] * 4 + [SWALLOWS] * 3)
+    found = decide(table, [0, 1] * 7)
+    assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
+    assert (found.certainty[24:36] > 0.99).all()
+
+
+def test_what_views_report_is_counted_on_clear_points() -> None:
+    """One view calls the whole book shelf, and has a mask of nothing else; it sees what is beside both, too."""
+    table = hand_table(N + 40, [KNOWS] * 3 + [[(range(N), ONE)]])
+    reports = decide(table, [0, 1] * 3 + [0]).scene.reports
+    assert reports.column.tolist() == [[0, 1, 2]] * 3 + [[0, -1, 1]]
+    first = reports.first[3]
+    shelf, book, background = reports.chance[first : reports.first[4]].reshape(3, 2)
+
+    def chance(counted: float, total: float) -> float:
+        return LEAST + (1 - LEAST) * counted / (total + EXPECTED)
+
+    # The points are all but certain: as if counted on them.
+    np.testing.assert_allclose(shelf, [chance(40 + EXPECTED, 40), LEAST], atol=0.02)
+    np.testing.assert_allclose(book, [chance(20, 20), chance(EXPECTED, 20)], atol=0.02)
+    np.testing.assert_allclose(background, [LEAST, chance(40 + EXPECTED, 40)], atol=0.02)
+
+
+def test_points_that_adjoin_an_instance_may_be_of_it_though_no_mask_of_it_holds_them() -> None:
+    """Two views see the whole object, and each misses another half of its last points, of which they say nothing else:
+    what lies in a mask without a group."""
+    views: list[HandView] = [[(range(56), ONE), (range(56, N), OTHER)]] * 2
+    found = decide(hand_table(N, views), [0, -1] * 2)
+    assert found.instance_ids.tolist() == [0] * 56 + [BACKGROUND] * 4
+    assert (found.certainty[57:] < found.certainty[10]).all()
+
+
+@pytest.mark.parametrize("numbers", [[], [-1] * 3])
+def test_without_any_group_all_that_is_seen_is_background(numbers: list[int]) -> None:
+    views: list[HandView] = [[(range(30), ONE)]] * 3 if numbers else [[]] * 3
+    found = decide(hand_table(N, views, [range(50, 60)] * 3), numbers)
+    assert set(found.instance_ids[:50]) == {BACKGROUND}
+    assert found.instance_ids[-1] == UNOBSERVED
+
+
+def test_colors_decide_where_views_do_not() -> None:
+    """Two views draw a border at 30 and two at 32; colors say where it is."""
+    early, late = ([(range(border), ONE), (range(border, N), OTHER)] for border in (30, 32))
+    table = hand_table(N, [early, early, late, late])
+    for border in (30, 32):
+        rgb = np.where(np.arange(N) < border, 40, 200).astype(np.uint8)[:, None].repeat(3, axis=1)
+        found = told(table, [0, 1] * 4, rgb=rgb)
+        assert found.instance_ids.tolist() == [0] * border + [1] * (N - border)
+
+
+def test_a_part_of_a_scene_is_decided_as_within_it() -> None:
+    """Farther from its ends than points hear in all rounds."""
+    table, numbers = torn_case(np.random.default_rng(3))
+    whole = told(table, numbers)
+    alone, part = (told(table, numbers, slice(40, 160), scene) for scene in (None, whole))
+    assert part.scene.reports is whole.scene.reports
+    np.testing.assert_array_equal(part.instance_ids[40:80], whole.instance_ids[80:120])
+    np.testing.assert_allclose(part.certainty[40:80], whole.certainty[80:120], rtol=1e-5)
+    assert not np.allclose(alone.certainty[40:80], whole.certainty[80:120], rtol=1e-3)
+
+
+def test_points_by_parts_of_memory_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    table, numbers = torn_case(np.random.default_rng(3))
+    at_once = decide(table, numbers)
+    monkeypatch.setattr(votes_module, "ENTRIES_AT_ONCE", 100)
+    in_parts = decide(table, numbers)
+    np.testing.assert_array_equal(in_parts.instance_ids, at_once.instance_ids)
+    np.testing.assert_array_equal(in_parts.certainty, at_once.certainty)
+    assert len(set(at_once.instance_ids)) >= 5
