@@ -9,7 +9,7 @@ from test_grouping import ONE, hand_table
 
 from og_pointcloud.fitting.holes import STRAIGHT_EDGE, WINDOW, seen_through_holes
 from og_pointcloud.fitting.mask_table import SEEN_THROUGH
-from og_pointcloud.fitting.membership import without_see_through
+from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
 

@@ -19,14 +19,13 @@ from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
     _clear,
-    _object,
     _share_openly,
     _Support,
     _without_islands,
     assign_points,
     instance_area,
-    without_see_through,
 )
+from og_pointcloud.fitting.see_through import _object, without_see_through
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes, votes_of_points
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians

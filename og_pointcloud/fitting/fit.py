@@ -16,10 +16,10 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight
-from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.reliability import likely_cause, split_half
+from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.fitting.seen_colors import doubted_by_color
 from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
@@ -100,7 +100,7 @@ class Prepared:
     """What the stages before labelling found; all modes but "paper", which draws points differently, share it.
 
     scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface,
-    without what lies behind a mask's object (membership.without_see_through). Views cut from one photograph are one
+    without what lies behind a mask's object (see_through.py). Views cut from one photograph are one
     view of the table, except in mode "paper".
     """
 
@@ -230,7 +230,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
 
 
 def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:
-    """The table without what its masks show behind their objects (`membership.without_see_through`)."""
+    """The table without what its masks show behind their objects (`without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
     poses = np.stack([camera.world_to_camera for camera in cameras])
     # Of the full images, as the masks' areas are by now.

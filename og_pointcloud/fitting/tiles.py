@@ -35,9 +35,10 @@ from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
-from og_pointcloud.fitting.membership import SceneVotes, assign_points, without_see_through
+from og_pointcloud.fitting.membership import SceneVotes, assign_points
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
+from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, readable_photograph, sight_ratios
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
