@@ -103,8 +103,7 @@ MUTATIONS = (
     ),
     Mutation(
         "what lies in a mask without a group lies in none", "fitting/view_reports.py",
-        "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)",
-        ("test_membership.py", "test_view_reports.py"),
+        "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)", MEMBERSHIP,
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",
