@@ -103,14 +103,13 @@ def assign_points(
     clear = _clear(support, openly, settings)
     weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
     of_masks = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group], table.mask_view
-    size = len(has_mask.T), groups.count
+    size = votes.vote.shape[0], groups.count
     likely, reports = likely_states(
         of_points, of_masks, size, clear, support.group, openly, around, weights, scene.reports if scene else None
     )
-    ids = likely.likeliest(np.full(len(clear), UNOBSERVED, np.int32), groups.count)
     possible = (support.share > settings.possible_share) & (support.share_openly > settings.possible_openly)
-    ids = _completed(ids, support, possible, (table, groups.group), around, weights, settings)
-    certainty = likely.of(ids, groups.count) * _agreeing(ids, around.index, around.adjoining)
+    ids = _completed(likely.ids, support, possible, (table, groups.group), around, weights, settings)
+    certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids, certainty.astype(np.float32), rate.astype(np.float32), dismissed, SceneVotes(typical, complete, reports)
     )

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import BACKGROUND
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.view_votes import VotesOfPoints
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
@@ -71,23 +71,24 @@ class ViewReports:
 @dataclass(frozen=True)
 class LikelyStates:
     """The states that each point may be in: state[start[g] : start[g + 1]], groups, and background as the number after
-    the last group; none where no view sees it. They are background, the groups in whose masks it lies, and those that
-    points that adjoin it are in for now. masked: (all,) bool, it lies in a mask of that group. likely: (all,) float64,
-    of sum 1 a point."""
+    the last group; none where no view sees it. They are background, the groups in whose masks it lies, and those of
+    points that adjoin it. masked: (all,) bool, it lies in a mask of that group. likely: (all,) float64, of sum 1 a
+    point. background: its number."""
 
     start: NDArray[np.int64]
     state: NDArray[np.int32]
     masked: NDArray[np.bool_]
     likely: NDArray[np.float64]
+    background: int
 
-    def likeliest(self, ids: NDArray[np.int32], background: int) -> NDArray[np.int32]:
-        """(n,) the likeliest state of each point (ties: the lowest number); that in ``ids`` where it has none."""
-        best = _likeliest(self.start, self.state, self.likely, ids)
-        return np.where(best == background, BACKGROUND, best).astype(np.int32)
+    @property
+    def ids(self) -> NDArray[np.int32]:
+        """(n,) the likeliest group of each point (ties: the lowest), BACKGROUND, or UNOBSERVED where it has no state."""
+        return _likeliest(self.start, self.state, self.likely, self.background)
 
-    def of(self, ids: NDArray[np.int32], background: int) -> NDArray[np.float64]:
+    def of(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
         """(n,) how likely each point is in the state of ``ids``; 0 where that is none it may be in."""
-        return _likely_in(self.start, self.state, self.likely, np.where(ids == BACKGROUND, background, ids))
+        return _likely_in(self.start, self.state, self.likely, np.where(ids == BACKGROUND, self.background, ids))
 
 
 def likely_states(
@@ -95,7 +96,7 @@ def likely_states(
     of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
     size: tuple[int, int],
     clear: NDArray[np.int32],
-    near: NDArray[np.int32],
+    asked: NDArray[np.int32],
     openly: NDArray[np.float32],
     around: Neighborhood,
     weights: NDArray[np.float32],
@@ -104,11 +105,12 @@ def likely_states(
     """How likely points are in each state, and what views report.
 
     of_masks: the group of each mask, -1 none, which says nothing; and its view. size: views and groups. clear: (n,) the
-    states of points that are clear, UNOBSERVED of others. openly: (n,) in [0, 1], what counts of votes on each point.
+    states of points that are clear, UNOBSERVED of others. asked: (n,) the group that each point is asked of, -1 none:
+    points that adjoin it may be of that group too. openly: (n,) in [0, 1], what counts of votes on each point.
     weights: of neighbors, as of `neighbor_weights`. reports: of the scene that these points are a part of; None: they
     are all of it, and it is counted on them.
     """
-    found = _candidates(of_points, of_masks[0], size[1], clear, near, around)
+    found = _candidates(of_points, of_masks[0], size[1], clear, asked, around)
 
     def settled_by(reports: ViewReports) -> LikelyStates:
         return _settled(_evidence(of_points, of_masks, found, openly, reports), found, around, weights, openly)
@@ -130,23 +132,22 @@ def _candidates(
     group: NDArray[np.int32],
     groups: int,
     clear: NDArray[np.int32],
-    near: NDArray[np.int32],
+    asked: NDArray[np.int32],
     around: Neighborhood,
 ) -> LikelyStates:
     """Those of each point; a clear one is likely in its state alone, and others in none. group: (masks,)."""
-    low, found = 0, []
+    low, found, clear = 0, [], np.where(clear == BACKGROUND, groups, clear)
     for some in of_points:
         masks, views = some()
-        states = np.where(clear == BACKGROUND, groups, clear)
-        found.append(_of_each_point(masks, views[0], low, group, groups, states, near, around.index, around.adjoining))
+        found.append(_of_each_point(masks, views[0], low, group, groups, clear, asked, around.index, around.adjoining))
         low += len(masks[0]) - 1
     counts, state, masked, likely = (np.concatenate(parts) for parts in zip(*found, strict=True))
     start = np.concatenate([[0], np.cumsum(counts)])
-    return LikelyStates(start, state, masked, likely)
+    return LikelyStates(start, state, masked, likely, groups)
 
 
 @njit(cache=True)
-def _of_each_point(masks, view_start, low, group, groups, clear, near, neighbors, adjoining):  # noqa: ANN001, ANN202
+def _of_each_point(masks, view_start, low, group, groups, clear, asked, neighbors, adjoining):  # noqa: ANN001, ANN202
     """(n,) how many candidates each of the points from ``low`` on has; and (all,) which, which of them it lies in a
     mask of, and 1 for those that are clear."""
     mask_start, of_mask = masks
@@ -167,7 +168,7 @@ def _of_each_point(masks, view_start, low, group, groups, clear, near, neighbors
                 found[end] = k
                 end += 1
         for j in range(neighbors.shape[1]):
-            k = near[neighbors[g, j]]
+            k = asked[neighbors[g, j]]
             if adjoining[g, j] and k >= 0 and not _holds(found, begin, end, k):
                 found[end], masked[end] = k, False
                 end += 1
@@ -317,7 +318,7 @@ def _evidence(
 ) -> NDArray[np.float64]:
     """(candidates,) the logarithm of how likely views make each, but for what all of a point have in common."""
     evidence, low = np.where(found.masked, 0, -UNSEEN), 0
-    evidence[found.state == reports.column.shape[1] - 1] = MORE_LIKELY
+    evidence[found.state == found.background] = MORE_LIKELY
     table = reports.column, reports.seat, reports.first, reports.chance
     for some in of_points:
         votes = some()
@@ -402,15 +403,17 @@ def _heard(start, state, evidence, likely, neighbors, weights, openly):  # noqa:
 
 
 @njit(cache=True)
-def _likeliest(start, state, likely, ids):  # noqa: ANN001, ANN202
-    """`LikelyStates.likeliest`, background by its number."""
-    best = ids.copy()
+def _likeliest(start, state, likely, background):  # noqa: ANN001, ANN202
+    """`LikelyStates.ids`."""
+    ids = np.full(len(start) - 1, UNOBSERVED, np.int32)
     for g in range(len(ids)):
-        most = -1.0
+        best, most = background, -1.0
         for c in range(start[g], start[g + 1]):
-            if likely[c] > most or (likely[c] == most and state[c] < best[g]):
-                best[g], most = state[c], likely[c]
-    return best
+            if likely[c] > most or (likely[c] == most and state[c] < best):
+                best, most = state[c], likely[c]
+        if most >= 0:
+            ids[g] = BACKGROUND if best == background else best
+    return ids
 
 
 @njit(cache=True)
