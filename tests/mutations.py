@@ -107,11 +107,11 @@ MUTATIONS = (
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",
-        "likely[o] * openly[other]", "likely[o]", MEMBERSHIP,
+        "loudness * weights[g, j] * openly[other]", "loudness * weights[g, j]", MEMBERSHIP,
     ),
     Mutation(
         "neighbors are heard whatever their color", "fitting/view_reports.py",
-        "SMOOTHNESS * weights[g, j]", "SMOOTHNESS", (*hard("votes-borders_by_color"), "test_view_reports.py"),
+        "loudness * weights[g, j] *", "loudness *", (*hard("votes-borders_by_color"), "test_view_reports.py"),
     ),
     Mutation(
         "a part of a scene counts its own reports", "fitting/view_reports.py",

@@ -47,7 +47,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_reports.EXPECTED": ("", ("_share",)),
     "fitting.view_reports.UNSEEN": ("", ()),
     "fitting.view_reports.MORE_LIKELY": ("", ()),
-    "fitting.view_reports.SMOOTHNESS": ("", ("_heard",)),
+    "fitting.view_reports.SMOOTHNESS": ("", ()),
     "fitting.colors.MOST": ("table", ()),
     "fitting.colors.SURENESS_POWER": ("", ()),
     "fitting.seen_colors.OPEN_IS_SEEN": ("table", ("_believe",)),

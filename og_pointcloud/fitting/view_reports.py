@@ -83,7 +83,7 @@ class LikelyStates:
 
     @property
     def ids(self) -> NDArray[np.int32]:
-        """(n,) the likeliest group of each point (ties: the lowest), BACKGROUND, or UNOBSERVED where it has no state."""
+        """(n,) the likeliest group of each point (ties: the lowest) or BACKGROUND; UNOBSERVED where it has no state."""
         return _likeliest(self.start, self.state, self.likely, self.background)
 
     def of(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -375,13 +375,13 @@ def _settled(
 ) -> LikelyStates:
     """How likely states are by their evidence, and once points have heard their neighbors ROUNDS times."""
     likely = np.zeros_like(evidence)
-    for _ in range(1 + ROUNDS):  # at first no neighbor says anything
-        likely = _heard(found.start, found.state, evidence, likely, around.index, weights, openly)
+    for loudness in (0.0, *[SMOOTHNESS] * ROUNDS):  # at first no neighbor says anything
+        likely = _heard(found.start, found.state, evidence, likely, around.index, weights, openly, loudness)
     return replace(found, likely=likely)
 
 
 @njit(cache=True, parallel=True)
-def _heard(start, state, evidence, likely, neighbors, weights, openly):  # noqa: ANN001, ANN202
+def _heard(start, state, evidence, likely, neighbors, weights, openly, loudness):  # noqa: ANN001, ANN202
     """(candidates,) how likely each is by its evidence and by how likely it was of the points that adjoin."""
     heard = np.ones(len(likely))
     for g in prange(len(start) - 1):
@@ -389,14 +389,15 @@ def _heard(start, state, evidence, likely, neighbors, weights, openly):  # noqa:
         if end - begin < 2:
             continue
         value = evidence[begin:end].copy()
-        for j in range(neighbors.shape[1]):
-            if weights[g, j] == 0:
-                continue
+        for j in range(neighbors.shape[1] if loudness > 0 else 0):
             other = neighbors[g, j]
+            voice = loudness * weights[g, j] * openly[other]
+            if voice == 0:
+                continue
             for o in range(start[other], start[other + 1]):
                 for c in range(begin, end):
                     if state[c] == state[o]:
-                        value[c - begin] += SMOOTHNESS * weights[g, j] * likely[o] * openly[other]
+                        value[c - begin] += voice * likely[o]
         value = np.exp(value - value.max())
         heard[begin:end] = value / value.sum()
     return heard

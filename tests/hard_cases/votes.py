@@ -184,8 +184,8 @@ def _assigned(
 
 
 def _both(seed: int, rgb: NDArray[np.uint8] | None = None) -> tuple[Membership, tuple[NDArray, NDArray]]:
-    """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask; of the
-    last mask the group is not known."""
+    """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask; the
+    last mask is of none."""
     table = _table(seed)
     group = [mask % 3 for mask in range(12)]
     group[3 + seed % 3], group[-1] = 3, -1
