@@ -95,23 +95,12 @@ def membership(
         missed = np.mean(total[sure[k]] - masked[sure[k]])
         if len(views_of[k]) == 1 and by_others < 0.5 and (1 - found) ** missed < settings.missed_chance:
             kept.remove(k)
-    # A view that has a mask of an instance says "not it" as far as its masks hold what it sees of the sure points.
-    inside = np.zeros((count, len(votes.weight), len(points)))
-    for mask, view in enumerate(mask_view):
-        inside[group[mask], view] += votes.inside[mask] if group[mask] >= 0 else 0
-    complete = np.zeros((count, len(votes.weight)))
-    for k in range(count):
-        for view in views_of[k]:
-            seen = votes.weight[view, sure[k]].sum()
-            complete[k, view] = inside[k, view, sure[k]].sum() / seen if seen > 0 else 1.0
-        without = votes.weight - inside[k]
-        asked[k] = own[k] + complete[k] @ without
     best, share = best_of(kept)
     openly = np.zeros(len(points))  # the share where each vote counts by itself once more
     for g in np.flatnonzero(best >= 0):
-        of_view, weight = inside[best[g], :, g], votes.weight[:, g]
-        asked_openly = of_view + complete[best[g]] * (weight - of_view)
-        openly[g] = (of_view * weight).sum() / (asked_openly * weight).sum()
+        of_best = np.array([votes.inside[mask, g] if group[mask] == best[g] else 0.0 for mask in range(len(group))])
+        by_view = np.bincount(mask_view, of_best, len(votes.weight))
+        openly[g] = by_view @ votes.weight[:, g] / (votes.weight[views_of[int(best[g])], g] ** 2).sum()
 
     seen = sorted(votes.openness[votes.openness > 0])
     typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2

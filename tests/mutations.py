@@ -130,10 +130,6 @@ MUTATIONS = (
         "sureness**SURENESS_POWER", "np.ones_like(sureness)", ("test_colors.py",),
     ),
     Mutation(
-        "part of a thing in a mask contradicts the rest of it", "fitting/membership.py",
-        "np.clip(part, 0, 1)", "np.ones_like(part)", (*MEMBERSHIP, "test_membership.py"),
-    ),
-    Mutation(
         "a large group keeps what a smaller one is sure of", "fitting/membership.py",
         "if sure > best[g] and", "if sure < best[g] and", (*MEMBERSHIP, "test_membership.py"),
     ),

@@ -147,8 +147,7 @@ def _labels(table: MaskTable, around: Neighborhood, settings: FitSettings) -> tu
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
     By votes alone, not by neighbors: what these mend is the same for all sizes, and a judge that saw hidden points by
-    hearsay would hold it against labels that do not. Nor does it doubt what few views show, or judge how complete masks
-    are: half of the views judge.
+    hearsay would hold it against labels that do not. Nor does it doubt what few views show: half of the views judge.
     """
     groups = group_masks(table, settings.grouping)
     return assign_by_votes_alone(table, view_votes(table), groups, around, settings.membership), groups.count

@@ -3,15 +3,13 @@
 A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
 
     for_k(g)       votes for "in a mask of k" (see `view_votes`)
-    possible_k(g)  for_k, and the other votes on g of the views that have a mask of k, each times how complete the masks
-                   of k are there: the part of k's clear points seen in that view that lies in them
+    possible_k(g)  votes on g of the views that have a mask of k
     share          for_k / possible_k
 
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
-k", with half a voice if its masks hold but a half of what it sees of k. So a share near 1 means "k", near 0 "seen, and
-not k", however often the proposer misses or splits. A point in masks of several groups is asked of the one with the
-most votes. But proposers let large things swallow small ones: where that group's own views contradict it and a smaller
-one is sure, the smaller one is asked.
+k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. A point in masks of several
+groups is asked of the one with the most votes. But proposers let large things swallow small ones: where that group's own
+views contradict it and a smaller one is sure, the smaller one is asked.
 
 Points whose state is clear from that are those that views see openly and agree on. Where no view sees a point openly,
 all votes on it are hearsay: rays that slip through a surface agree about what lies behind it, and are wrong. What
@@ -53,11 +51,9 @@ from og_pointcloud.settings import MembershipSettings
 @dataclass(frozen=True)
 class SceneVotes:
     """What all votes of a scene say, for points that are a part of it. typical_openness: as of `ViewVotes`.
-    completeness: (groups, views) float32 in [0, 1], the part of what a view sees of a group's sure points that lies in
-    its masks of the group; 0 where it has none. reports: what each view reports of each state."""
+    reports: what each view reports of each state."""
 
     typical_openness: float
-    completeness: NDArray[np.float32]
     reports: ViewReports
 
 
@@ -90,13 +86,12 @@ def assign_points(
     rgb: (n, 3), or None: colors are not asked. scene: of which these points are a part; None: they are all of it.
     """
     has_mask = views_with_masks(table, groups)
-    # Points choose twice. As if all masks were complete: that shows which groups are noise, and what is missing in the
-    # masks of the others. Then among the others, by masks as complete as they are.
-    of_points, of_masks = votes_of_points(votes), (groups.group, table.mask_view)
-    support = _support(of_points, *of_masks, has_mask.astype(np.float32), np.ones(groups.count, np.bool_), settings)
+    # Points choose twice: among all groups, which shows those that are noise, and among the others.
+    of_points = votes_of_points(votes)
+    asked = of_points, groups.group, table.mask_view, has_mask
+    support = _support(*asked, np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    complete = scene.completeness if scene else _completeness(votes, *of_masks, has_mask, support)
-    support = _support(of_points, *of_masks, complete, ~dismissed, settings)
+    support = _support(*asked, ~dismissed, settings)
 
     typical = scene.typical_openness if scene else votes.typical_openness
     openly = _openly(votes.openness, settings.open_share * typical)
@@ -111,17 +106,17 @@ def assign_points(
     ids = _completed(likely.ids, support, possible, (table, groups.group), around, weights, settings)
     certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
-        ids, certainty.astype(np.float32), rate.astype(np.float32), dismissed, SceneVotes(typical, complete, reports)
+        ids, certainty.astype(np.float32), rate.astype(np.float32), dismissed, SceneVotes(typical, reports)
     )
 
 
 def assign_by_votes_alone(
     table: MaskTable, votes: ViewVotes, groups: MaskGroups, around: Neighborhood, settings: MembershipSettings
 ) -> NDArray[np.int32]:
-    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all masks were
-    complete, and seen openly alike. For a few views of many: they tell nothing of what each of them reports."""
+    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if they
+    were seen openly alike. For a few views of many: they tell nothing of what each of them reports."""
     has_mask = views_with_masks(table, groups)
-    asked = votes_of_points(votes), groups.group, table.mask_view, has_mask.astype(np.float32)
+    asked = votes_of_points(votes), groups.group, table.mask_view, has_mask
     support = _support(*asked, np.ones(groups.count, np.bool_), settings)
     _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), replace(settings, missed_chance=0.0))
     support = _support(*asked, ~dismissed, settings)
@@ -203,58 +198,25 @@ def _support(
     of_points: VotesOfPoints,
     group: NDArray[np.int32],
     mask_view: NDArray[np.int32],
-    completeness: NDArray[np.float32],
+    has_mask: NDArray[np.bool_],
     allowed: NDArray[np.bool_],
     settings: MembershipSettings,
 ) -> _Support:
     """The support of all points.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
-    each. completeness: (groups, views), as of `SceneVotes`. allowed: (groups,) those that may be chosen.
+    each. has_mask: (groups, views), whether a view has a mask of a group. allowed: (groups,) those that may be chosen.
     """
-    of_masks = group, mask_view, completeness
     found = []
     for some in of_points:
         votes = some()
-        best, *of_best = _best_group(*votes, *of_masks, allowed, settings.sure_share)
-        found.append((best, *of_best, _share_openly(*votes, *of_masks, best)))
+        best, *of_best = _best_group(*votes, group, has_mask, allowed, settings.sure_share)
+        found.append((best, *of_best, _share_openly(*votes, group, mask_view, has_mask, best)))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _completeness(
-    votes: ViewVotes,
-    group: NDArray[np.int32],
-    mask_view: NDArray[np.int32],
-    has_mask: NDArray[np.bool_],
-    support: _Support,
-) -> NDArray[np.float32]:
-    """(groups, views) as of `SceneVotes`; 1 where a view has a mask of a group and sees none of its sure points."""
-    sure = np.where(support.share > 0.5, support.group, -1)
-    inside, seen = np.zeros(has_mask.shape), np.zeros(has_mask.shape)
-    masks, views = ((matrix.indptr, matrix.indices, matrix.data) for matrix in (votes.in_mask, votes.vote))
-    _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen)
-    part = np.divide(inside, seen, out=np.ones(has_mask.shape), where=seen > 0)
-    return np.where(has_mask, np.clip(part, 0, 1), 0).astype(np.float32)
-
-
-@njit(cache=True)
-def _add_votes_on_sure(masks, views, group, mask_view, sure, inside, seen):  # noqa: ANN001, ANN202
-    """Adds to (groups, views): the votes of masks on their own group's sure points, and all votes on these. sure: (n,)
-    the group that each point is surely of, -1 none."""
-    start, points, vote = masks
-    for mask in range(len(start) - 1):
-        for e in range(start[mask], start[mask + 1]):
-            if group[mask] >= 0 and sure[points[e]] == group[mask]:
-                inside[group[mask], mask_view[mask]] += vote[e]
-    start, points, vote = views
-    for view in range(len(start) - 1):
-        for e in range(start[view], start[view + 1]):
-            if sure[points[e]] >= 0:
-                seen[sure[points[e]], view] += vote[e]
-
-
 @njit(cache=True, parallel=True)
-def _best_group(masks, views, group, mask_view, completeness, allowed, sure_share):  # noqa: ANN001, ANN202
+def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: ANN001, ANN202
     """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total.
 
     Where views that have a mask of that group contradict it, and a smaller group is sure, that one is taken: proposers
@@ -281,16 +243,14 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
                 before += 1
             if before < e:
                 continue
-            # Of the views, those that have a mask of the group could have voted for it; what they vote otherwise counts
-            # as far as their masks of it are complete.
+            # Of the views, those that have a mask of the group could have voted for it.
             of_group, asked = 0.0, 0.0
             for other in range(e, end):
-                mask = of_mask[other].row
-                if group[mask] == k:
+                if group[of_mask[other].row] == k:
                     of_group += of_mask[other].vote
-                    asked += (1 - completeness[k, mask_view[mask]]) * of_mask[other].vote
             for view in range(view_start[g], view_start[g + 1]):
-                asked += completeness[k, of_view[view].row] * of_view[view].vote
+                if has_mask[k, of_view[view].row]:
+                    asked += of_view[view].vote
             if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
                 best[g], votes[g], possible[g] = k, of_group, asked
             if of_group > sure_share * asked and (of_group > of_sure or (of_group == of_sure and k < sure)):
@@ -301,7 +261,7 @@ def _best_group(masks, views, group, mask_view, completeness, allowed, sure_shar
 
 
 @njit(cache=True, parallel=True)
-def _share_openly(masks, views, group, mask_view, completeness, best):  # noqa: ANN001, ANN202
+def _share_openly(masks, views, group, mask_view, has_mask, best):  # noqa: ANN001, ANN202
     """(n,) `_Support.share_openly` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
     (mask_start, of_mask), (view_start, of_view) = masks, views
     share = np.zeros(len(best))
@@ -316,8 +276,8 @@ def _share_openly(masks, views, group, mask_view, completeness, best):  # noqa: 
                     inside += of_mask[e].vote
                 e += 1
             of_group += inside * of_view[view].vote
-            complete = completeness[best[g], of_view[view].row]
-            asked += (inside + complete * (of_view[view].vote - inside)) * of_view[view].vote
+            if has_mask[best[g], of_view[view].row]:
+                asked += of_view[view].vote ** 2
         share[g] = of_group / asked if asked > 0 else 0.0
     return share
 
