@@ -7,9 +7,9 @@ A mask covers a point or it does not; what matters is what the *other* views say
     share          for_k / possible_k
 
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
-k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. A point in masks of several
-groups is asked of the one with the most votes. But proposers let large things swallow small ones: where that group's own
-views contradict it and a smaller one is sure, the smaller one is asked.
+k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. A point in masks of
+several groups is asked of the one with the most votes. But proposers let large things swallow small ones: where that
+group's own views contradict it and a smaller one is sure, the smaller one is asked.
 
 Points whose state is clear from that are those that views see openly and agree on. Where no view sees a point openly,
 all votes on it are hearsay: rays that slip through a surface agree about what lies behind it, and are wrong. What
