@@ -113,8 +113,8 @@ def assign_points(
 def assign_by_votes_alone(
     table: MaskTable, votes: ViewVotes, groups: MaskGroups, around: Neighborhood, settings: MembershipSettings
 ) -> NDArray[np.int32]:
-    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if they
-    were seen openly alike. For a few views of many: they tell nothing of what each of them reports."""
+    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if they were seen
+    openly alike. For a few views of many: they tell nothing of what each of them reports."""
     has_mask = views_with_masks(table, groups)
     asked = votes_of_points(votes), groups.group, table.mask_view, has_mask
     support = _support(*asked, np.ones(groups.count, np.bool_), settings)

@@ -43,9 +43,9 @@ background, and what it has no mask of, in none."""
 UNSEEN = 2.0
 """What it costs an instance, in the logarithm of its likelihood, that no view has a mask of it on the point."""
 MORE_LIKELY = 0.2
-"""What background has before any view is asked: a wrong name is worse than none."""
+"""What background has in that logarithm before any view is asked: a wrong name is worse than none."""
 SMOOTHNESS = 0.5
-"""What a sure neighbor adds to that logarithm, if colors say nothing of the two."""
+"""What a sure neighbor adds to the logarithm of its state, if colors say nothing of the two."""
 ROUNDS = 5
 """Times that points hear their neighbors."""
 COUNTED = 2
