@@ -72,9 +72,9 @@ def membership_of_any_votes(seed: float) -> Answer:
     return Answer(ours.instance_ids, ids)
 
 
-@agrees(1e-4, "seed", tuple(range(4)))
+@agrees(1e-6, "seed", tuple(range(4)))
 def certainty_of_any_votes(seed: float) -> Answer:
-    """How sure of it the same points are; chances of reports are kept in float32."""
+    """How sure of it the same points are."""
     ours, (_, certainty) = _both(int(seed))
     return Answer(ours.certainty, certainty)
 
