@@ -114,11 +114,12 @@ class MembershipSettings(_Checked):
     """Nothing is clear of a point that is seen less than this share as openly as the scene's others, and votes on it
     count the less, the less openly it is seen."""
     possible_share: float = 0.2
-    """A point is clearly of none below this share. From it on it may be of an instance that it adjoins,"""
+    """A point is clearly of none below this share. From it on it may be of an instance that it adjoins."""
     possible_openly: float = 0.2
-    """if it has this share too where each vote counts by itself once more, so that views that see it openly decide,"""
+    """But only if it has this share too where each vote counts by itself once more: views that see it openly decide."""
     growth_votes: float = 0.25
-    """and becomes one of it when this share of the adjoining points, as far as colors say, are so already."""
+    """Such a point becomes one of the instance when this share of the adjoining ones, as far as colors say, is so
+    already."""
     rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     missed_chance: float = 0.02
