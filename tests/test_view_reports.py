@@ -104,6 +104,14 @@ def test_a_part_of_a_scene_is_decided_as_within_it() -> None:
     assert not np.allclose(alone.certainty[40:80], whole.certainty[80:120], rtol=1e-3)
 
 
+def test_a_thing_too_small_for_the_sample_that_reports_were_counted_on_is_found() -> None:
+    table = hand_table(N, [[(range(30), ONE), (range(50, 55), OTHER)]] * 4)
+    sample = told(table, [0, 1] * 4, slice(50))
+    assert (sample.scene.reports.column[:, 1] == -1).all()
+    found = told(table, [0, 1] * 4, whole=sample).instance_ids
+    assert found.tolist() == [0] * 30 + [BACKGROUND] * 20 + [1] * 5 + [BACKGROUND] * 5
+
+
 def test_points_by_parts_of_memory_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     table, numbers = torn_case(np.random.default_rng(3))
     at_once = decide(table, numbers)

@@ -136,27 +136,26 @@ def _candidates(
     around: Neighborhood,
 ) -> LikelyStates:
     """Those of each point; a clear one is likely in its state alone, and others in none. group: (masks,)."""
-    low, found, clear = 0, [], np.where(clear == BACKGROUND, groups, clear)
+    low, found, clear = 0, [], np.where(clear == BACKGROUND, groups, clear)  # as candidates are numbered
     for some in of_points:
         masks, views = some()
-        found.append(_of_each_point(masks, views[0], low, group, groups, clear, asked, around.index, around.adjoining))
+        found.append(_of_each_point(masks, views[0], low, group, groups, asked, around.index, around.adjoining))
         low += len(masks[0]) - 1
-    counts, state, masked, likely = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    start = np.concatenate([[0], np.cumsum(counts)])
+    counts, state, masked = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    start, likely = np.concatenate([[0], np.cumsum(counts)]), (state == np.repeat(clear, counts)).astype(np.float64)
     return LikelyStates(start, state, masked, likely, groups)
 
 
 @njit(cache=True)
-def _of_each_point(masks, view_start, low, group, groups, clear, asked, neighbors, adjoining):  # noqa: ANN001, ANN202
-    """(n,) how many candidates each of the points from ``low`` on has; and (all,) which, which of them it lies in a
-    mask of, and 1 for those that are clear."""
+def _of_each_point(masks, view_start, low, group, groups, asked, neighbors, adjoining):  # noqa: ANN001, ANN202
+    """(n,) how many candidates each of the points from ``low`` on has; and (all,) which, and which of them it lies in
+    a mask of."""
     mask_start, of_mask = masks
     n = len(mask_start) - 1
     count = np.zeros(n, np.int64)
     # A point has background, and at most one for each mask and each neighbor.
     found = np.empty(n * (neighbors.shape[1] + 1) + len(of_mask), np.int32)
-    masked = np.ones(len(found), np.bool_)
-    likely = np.zeros(len(found))
+    masked = np.empty(len(found), np.bool_)
     end = 0
     for i in range(n):
         if view_start[i] == view_start[i + 1]:
@@ -165,19 +164,17 @@ def _of_each_point(masks, view_start, low, group, groups, clear, asked, neighbor
         for e in range(mask_start[i], mask_start[i + 1]):
             k = group[of_mask[e].row]
             if k >= 0 and not _holds(found, begin, end, k):
-                found[end] = k
+                found[end], masked[end] = k, True
                 end += 1
         for j in range(neighbors.shape[1]):
             k = asked[neighbors[g, j]]
             if adjoining[g, j] and k >= 0 and not _holds(found, begin, end, k):
                 found[end], masked[end] = k, False
                 end += 1
-        found[end] = groups
+        found[end], masked[end] = groups, True
         end += 1
-        for c in range(begin, end):
-            likely[c] = 1.0 if found[c] == clear[g] else 0.0
         count[i] = end - begin
-    return count, found[:end].copy(), masked[:end].copy(), likely[:end].copy()
+    return count, found[:end].copy(), masked[:end].copy()
 
 
 @njit(cache=True)
@@ -349,13 +346,15 @@ def _add_evidence(masks, views, low, of_masks, candidates, openly, reports, evid
                 k, total = state[c], 0.0
                 for m in range(here, e + 1):
                     # Last of all: in no mask.
-                    part, r = none, width - 1
+                    said, part, r = background, none, width - 1
                     if m < e:
-                        r = column[view, group[of_mask[m].row]] if group[of_mask[m].row] >= 0 else -1
-                        part = of_mask[m].vote
-                    if r < 0 or part <= 0:
+                        said, part = group[of_mask[m].row], of_mask[m].vote
+                        r = column[view, said] if said >= 0 else -1
+                    if said < 0 or part <= 0:
                         continue
-                    if seat[view, k] >= 0:
+                    if r < 0:  # a group of which the points that reports were counted on show nothing
+                        reported = _at_least(1.0 if k == said else 0.0)
+                    elif seat[view, k] >= 0:
                         reported = chance[first[view] + seat[view, k] * width + r]
                     else:
                         reported = _at_least(1.0 if r == _expected(column[view, k], width) else 0.0)
