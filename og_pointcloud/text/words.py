@@ -19,6 +19,8 @@ Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary 
 TextFeatures: TypeAlias = "StrPath | tuple[Vocabulary, str] | None"
 LONGEST_WORD = 60
 """Characters of a word that is not known that are said again."""
+FEW_WORDS = 24
+"""Known words that are all named where one is asked for that is not among them, nor like any."""
 
 
 def resolve_labels(
@@ -113,7 +115,9 @@ def _looked_up(
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
         hint = did_you_mean(missing[0], vectors, " If not")
         first = printable(missing[0], LONGEST_WORD)
+        few = not hint and 0 < len(vectors) <= FEW_WORDS
+        known = f" ({printable(', '.join(sorted(vectors)), 300)})" if few else ""
         raise OgPointcloudError(
-            f"'{first}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
+            f"'{first}' is not among the {len(vectors)} known words{known}{others}{hint}: {_ways(feature_space)}"
         )
     return _stacked(words, (vectors[word] for word in words)).astype(np.float32)
