@@ -7,14 +7,16 @@ A room is fitted twice, from the same masks: as a 3DGS of what its photographs s
 Gaussian's truth is that of the nearest point of a dense exact cloud, if one is as near as it is large. But Gaussians
 may lie anywhere and reach over edges as long as photographs come out right. So labels are drawn as well, in photographs
 that neither the training nor the fit has seen: a pixel is of the class that most of its light comes from. Beside that
-stand the best of the baselines, and what the truth of the nearest point scores there, given to each Gaussian as its
-label. Writes OUT/splats.csv, and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
+stand the best of the baselines, what the truth of the nearest point scores there, given to each Gaussian as its label,
+and the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes OUT/splats.csv,
+and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -31,6 +33,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.metrics import Score
+from og_pointcloud.evaluate.sweep import warm_up
 from og_pointcloud.evaluate.truth import Truth
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
@@ -38,7 +41,7 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.splatting import Gaussians, render
+from og_pointcloud.rendering.splatting import Gaussians, render, view_weights
 from og_pointcloud.scene import Camera, Points
 from og_pointcloud.text.text_features import read_text_features
 
@@ -48,6 +51,9 @@ WIDTH, VIEWS, HELD_OUT = 256, 42, 6
 START, MOST = 5_000, 20_000
 """Points that a training begins with, and Gaussians at most."""
 DENSE = 300_000
+"""Points of the cloud from which Gaussians have their truth."""
+NEAR = 0.1
+"""Depth of the near plane, meters."""
 COVERED = 0.5
 """A pixel is drawn where so much of its light is of Gaussians."""
 
@@ -56,7 +62,8 @@ COVERED = 0.5
 class Row:
     """color_error: mean absolute difference of held-out photographs and the 3DGS, in [0, 1]. miou, background: of the
     Gaussians. drawn, drawn_background: of held-out photographs' pixels; baseline: the best one there, nearest: the
-    nearest points' truth there. cloud: mIoU of the room as a cloud."""
+    nearest points' truth there, possible: labels from these photographs' own truth. cloud: mIoU of the room as a cloud.
+    seconds: of the 3DGS's fit, capture in memory."""
 
     scene: str
     gaussians: int
@@ -67,7 +74,9 @@ class Row:
     drawn_background: float
     baseline: float
     nearest: float
+    possible: float
     cloud: float
+    seconds: float
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -102,16 +111,23 @@ def measured(name: str, output: Path) -> Row:
         write_ply(unfinished / "points.ply", {"vertex": gaussian_rows(_trained_on(fitted))})
         unfinished.rename(splat)
     scene, quiet = read_capture(splat), Journal(progress=False)
+    warm_up(scene)
+    start = time.perf_counter()
     prepared = prepare(scene, None, quiet)
+    labelled = fit_prepared(prepared, None, quiet)
+    seconds = time.perf_counter() - start
     truth, nearest = _truth(scene.points, exact)
-    called = answered(splat, fit_prepared(prepared, None, quiet), truth).called
+    called = answered(splat, labelled, truth).called
     words = read_text_features(splat / WORDS)[0]
     baselines = [truth.class_of(labels, words.names) for _, labels, _ in baseline_labels(prepared, words.vectors)]
-    score, (shown, error) = truth.score(called), _drawn(room, scene.points, called, output / f"{name}.png")
+    points, score = scene.points, truth.score(called)
+    shown, error = _drawn(room, points, called, output / f"{name}.png")
+    others = [nearest, _possible(room, points), *baselines]
+    of_nearest, possible, *of_baselines = (_drawn(room, points, labels)[0].miou for labels in others)
     return Row(
-        name, len(scene.points), error, score.miou, score.background_called or 0.0, shown.miou,
-        shown.background_called or 0.0, max(_drawn(room, scene.points, labels)[0].miou for labels in baselines),
-        _drawn(room, scene.points, nearest)[0].miou, measure(cloud, baselines=False).miou,
+        name, len(points), error, score.miou, score.background_called or 0.0, shown.miou,
+        shown.background_called or 0.0, max(of_baselines), of_nearest, possible, measure(cloud, baselines=False).miou,
+        seconds,
     )  # fmt: skip
 
 
@@ -157,20 +173,39 @@ def _truth(points: Points, exact: RoomCapture) -> tuple[Truth, NDArray[np.int32]
     return Truth(exact.cls[nearest], exact.names, near, near & exact.background[nearest]), exact.cls[nearest]
 
 
+def _class_of(capture: RoomCapture) -> NDArray[np.int32]:
+    """(objects + 1,) the class of each owner of a pixel; the last is of background."""
+    return np.array([*(capture.names.index(item.name) for item in capture.room.objects), -1], np.int32)
+
+
+def _in_world(points: Points) -> Gaussians:
+    return replace(Gaussians.from_points(points), xyz=points.xyz_world.astype(np.float32))
+
+
+def _possible(capture: RoomCapture, points: Points) -> NDArray[np.int64]:
+    """(n,) the class of the pixels, in photographs held out, that most of a Gaussian's light goes to, -1 background."""
+    gaussians, class_of, held_out = _in_world(points), _class_of(capture), _held_out(len(capture.frames))
+    light = np.zeros((len(capture.names) + 1, len(points)))
+    for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
+        ids = class_of[capture.frames[view].owner]
+        light += view_weights(gaussians, camera, ids, len(capture.names), NEAR).rows.toarray()
+    best = light.argmax(axis=0)
+    return np.where((best < len(capture.names)) & light.any(axis=0), best, -1)
+
+
 def _drawn(
     capture: RoomCapture, points: Points, labels: NDArray[np.integer], picture: Path | None = None
 ) -> tuple[Score, float]:
     """The score of labels drawn in the photographs held out, and how far colors are off there."""
-    class_of = np.append([capture.names.index(item.name) for item in capture.room.objects], -1)
+    gaussians, class_of = _in_world(points), _class_of(capture)
     classes, held_out = len(capture.names) + 1, _held_out(len(capture.frames))
     assert points.rgb is not None
     color = points.rgb.astype(np.float32) / 255
     values = np.concatenate([np.eye(classes + 1, dtype=np.float32)[labels], color], axis=1, dtype=np.float32)
-    gaussians = replace(Gaussians.from_points(points), xyz=points.xyz_world.astype(np.float32))
     truths, found, errors = [], [], []
     for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
         frame = capture.frames[view]
-        image, covered = render(gaussians, values, camera, near=0.1)
+        image, covered = render(gaussians, values, camera, NEAR)
         called = image[..., :-3].argmax(axis=2)
         called = np.where((called == classes) | (covered < COVERED), -1, called)
         truths.append(class_of[frame.owner])

@@ -177,7 +177,8 @@ def _likely_states(
             for g in points:
                 heard = {
                     k: evidence[g][k] + by.SMOOTHNESS * sum(
-                        alike[g, other] * open_[other] * before[other].get(k, 0) for other in neighbors[g]
+                        max(alike[g, other] - by.APART, 0) * open_[other] * before[other].get(k, 0)
+                        for other in neighbors[g]
                     )
                     for k in may[g]
                 }  # fmt: skip

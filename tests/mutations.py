@@ -107,11 +107,16 @@ MUTATIONS = (
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",
-        "loudness * weights[g, j] * openly[other]", "loudness * weights[g, j]", MEMBERSHIP,
+        "- APART, 0) * openly[other]", "- APART, 0)", MEMBERSHIP,
     ),
     Mutation(
         "neighbors are heard whatever their color", "fitting/view_reports.py",
-        "loudness * weights[g, j] *", "loudness *", (*hard("votes-borders_by_color"), "test_view_reports.py"),
+        "max(weights[g, j] - APART, 0)", "(weights[g, j] > 0) * (1 - APART)",
+        (*hard("votes-borders_by_color"), "test_view_reports.py"),
+    ),
+    Mutation(
+        "neighbors are heard although their color says another thing", "fitting/view_reports.py",
+        "max(weights[g, j] - APART, 0)", "weights[g, j]", MEMBERSHIP,
     ),
     Mutation(
         "a part of a scene counts its own reports", "fitting/view_reports.py",

@@ -44,8 +44,11 @@ UNSEEN = 2.0
 """What it costs an instance, in the logarithm of its likelihood, that no view has a mask of it on the point."""
 MORE_LIKELY = 0.2
 """What background has in that logarithm before any view is asked: a wrong name is worse than none."""
-SMOOTHNESS = 0.5
-"""What a sure neighbor adds to the logarithm of its state, if colors say nothing of the two."""
+SMOOTHNESS = 0.6
+"""What a sure neighbor adds to the logarithm of its state, times the ratio of its color (colors.py), less APART."""
+APART = 0.5
+"""A neighbor is not heard whose color is only so many times likelier within one thing than between two: the less colors
+say in a scene, the less its points follow their neighbors."""
 ROUNDS = 5
 """Times that points hear their neighbors."""
 COUNTED = 2
@@ -390,7 +393,7 @@ def _heard(start, state, evidence, likely, neighbors, weights, openly, loudness)
         value = evidence[begin:end].copy()
         for j in range(neighbors.shape[1] if loudness > 0 else 0):
             other = neighbors[g, j]
-            voice = loudness * weights[g, j] * openly[other]
+            voice = loudness * max(weights[g, j] - APART, 0) * openly[other]
             if voice == 0:
                 continue
             for o in range(start[other], start[other + 1]):
