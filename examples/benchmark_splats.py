@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.metrics import Score
 from og_pointcloud.evaluate.sweep import warm_up
-from og_pointcloud.evaluate.truth import Truth
+from og_pointcloud.evaluate.truth import GT_NAME, Truth
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.colors import label_colors
@@ -86,9 +86,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="rooms whose name begins so")
     parser.add_argument("--half", choices=("choose", "judge"), help="only this half")
     options = parser.parse_args(arguments)
-    rows = []
+    rows, rooms = [], [name for name in ROOMS if is_chosen(name, options.half, options.only)]
+    if not rooms:
+        parser.error(f"no room begins with {', '.join(options.only)}; expected one of {', '.join(ROOMS)}")
     print(" | ".join(each.name for each in fields(Row)))
-    for name in (name for name in ROOMS if is_chosen(name, options.half, options.only)):
+    for name in rooms:
         rows.append(measured(name, options.output))
         print(" | ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in asdict(rows[-1]).values()), flush=True)
     with (options.output / "splats.csv").open("w", newline="") as file:
@@ -109,6 +111,7 @@ def measured(name: str, output: Path) -> Row:
         write_capture(fitted, cloud)
         write_capture(fitted, unfinished := splat.with_suffix(".part"))
         write_ply(unfinished / "points.ply", {"vertex": gaussian_rows(_trained_on(fitted))})
+        (unfinished / GT_NAME).unlink()  # of the cloud
         unfinished.rename(splat)
     scene, quiet = read_capture(splat), Journal(progress=False)
     warm_up(scene)
