@@ -8,7 +8,7 @@ Gaussian's truth is that of the nearest point of a dense exact cloud, if one is 
 may lie anywhere and reach over edges as long as photographs come out right. So labels are drawn as well, in photographs
 that neither the training nor the fit has seen: a pixel is of the class that most of its light comes from. Beside that
 stand the best of the baselines, what the truth of the nearest point scores there, given to each Gaussian as its label,
-and the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes OUT/splats.csv,
+and about the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes OUT/splats.csv,
 and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
 """
 
@@ -28,7 +28,7 @@ from og_pointcloud_room.capture import RoomCapture, write_capture
 from og_pointcloud_zoo.draws import draw, is_chosen
 from og_pointcloud_zoo.make import drawn_capture
 from og_pointcloud_zoo.measure import WORDS, answered, measure
-from og_pointcloud_zoo.trained import trained
+from og_pointcloud_zoo.trained import NEAREST, trained
 from scipy.spatial import cKDTree
 
 from og_pointcloud.evaluate.baselines import baseline_labels
@@ -52,8 +52,6 @@ START, MOST = 5_000, 20_000
 """Points that a training begins with, and Gaussians at most."""
 DENSE = 300_000
 """Points of the cloud from which Gaussians have their truth."""
-NEAR = 0.1
-"""Depth of the near plane, meters."""
 COVERED = 0.5
 """A pixel is drawn where so much of its light is of Gaussians."""
 
@@ -150,13 +148,7 @@ def _cameras(capture: RoomCapture, views: Sequence[int] | NDArray[np.int64]) -> 
     lens = capture.intrinsics
     focal, middle = (lens.focal_px, lens.focal_px), (lens.width / 2, lens.height / 2)
     return [
-        Camera(
-            lens.width,
-            lens.height,
-            *focal,
-            *middle,
-            np.linalg.inv(capture.frames[k].camera_to_world).astype(np.float64),
-        )
+        Camera(lens.width, lens.height, *focal, *middle, np.linalg.inv(capture.frames[k].camera_to_world.astype(float)))
         for k in views
     ]
 
@@ -191,7 +183,7 @@ def _possible(capture: RoomCapture, points: Points) -> NDArray[np.int64]:
     light = np.zeros((len(capture.names) + 1, len(points)))
     for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
         ids = class_of[capture.frames[view].owner]
-        light += view_weights(gaussians, camera, ids, len(capture.names), NEAR).rows.toarray()
+        light += view_weights(gaussians, camera, ids, len(capture.names), NEAREST).rows.toarray()
     best = light.argmax(axis=0)
     return np.where((best < len(capture.names)) & light.any(axis=0), best, -1)
 
@@ -208,7 +200,7 @@ def _drawn(
     truths, found, errors = [], [], []
     for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
         frame = capture.frames[view]
-        image, covered = render(gaussians, values, camera, NEAR)
+        image, covered = render(gaussians, values, camera, NEAREST)
         called = image[..., :-3].argmax(axis=2)
         called = np.where((called == classes) | (covered < COVERED), -1, called)
         truths.append(class_of[frame.owner])

@@ -37,7 +37,9 @@ SPLIT_FROM = 0.01
 """Size, as a part of the extent, from which one is split in two of 1 / SPLIT size, and not copied."""
 SPLIT = 1.6
 LEAST_OPACITY = 0.005
+"""Less opaque Gaussians go."""
 BEHIND = 0.5
+"""The gray behind all."""
 NEAREST = 0.1
 """Depth of the near plane, meters."""
 REACH = 3.0
@@ -53,7 +55,8 @@ def trained(start: Points, cameras: Sequence[Camera], images: Sequence[Image], m
     start: points with colors to begin with, as structure from motion has them. images: (H, W, 3) in [0, 1], of each
     camera. most: Gaussians at most.
     """
-    rng, _ = np.random.default_rng(seed), torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    torch.manual_seed(seed)
     centers = np.stack([camera.center for camera in cameras])
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     now = _begun(start)
