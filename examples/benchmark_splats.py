@@ -8,8 +8,8 @@ Gaussian's truth is that of the nearest point of a dense exact cloud, if one is 
 may lie anywhere and reach over edges as long as photographs come out right. So labels are drawn as well, in photographs
 that neither the training nor the fit has seen: a pixel is of the class that most of its light comes from. Beside that
 stand the best of the baselines, what the truth of the nearest point scores there, given to each Gaussian as its label,
-and about the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes OUT/splats.csv,
-and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
+and about the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes
+OUT/splats.csv, and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
 """
 
 from __future__ import annotations
