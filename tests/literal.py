@@ -56,9 +56,9 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
 def membership(
     votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbors: list[list[int]],
     settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None,
-) -> tuple[Ids, Array]:  # fmt: skip
-    """Ids and certainty of every point. weights: (masks, n) pixels; neighbors: of each point, nearest first;
-    rgb: (n, 3)."""
+) -> tuple[Ids, Array, Array]:  # fmt: skip
+    """Ids and certainty of every point, and the expected IoU of every group. weights: (masks, n) pixels; neighbors: of
+    each point, nearest first; rgb: (n, 3)."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
     views_of: dict[int, list[int]] = {}
@@ -129,7 +129,12 @@ def membership(
     ids = _filled(_without_islands(ids, share, weights, group, neighbors, settings.island_share), neighbors)
     agreeing = [np.mean([ids[other] == ids[g] for other in neighbors[g]]) if neighbors[g] else 1.0 for g in points]
     of_state = [likely[g].get(count if ids[g] == BACKGROUND else int(ids[g]), 0.0) for g in points]
-    return ids, np.multiply(of_state, agreeing)
+    expected = np.zeros(count)
+    for k in range(count):
+        right = sum(of_state[g] for g in points if ids[g] == k)
+        of_group = sum(likely[g].get(k, 0.0) for g in points)
+        expected[k] = right / (np.count_nonzero(ids == k) + of_group - right) if of_group else 0.0
+    return ids, np.multiply(of_state, agreeing), expected
 
 
 def _likely_states(

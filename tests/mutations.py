@@ -171,6 +171,10 @@ MUTATIONS = (
         "certainty without the neighbors", "fitting/membership.py",
         "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
     ),
+    Mutation(
+        "what an instance lacks is not expected of it", "fitting/view_reports.py",
+        "minlength=count) + of_group - right", "minlength=count)", hard("votes-expected_iou_of_any_votes"),
+    ),
     # Grouping, association.
     Mutation(
         "groups join without a majority", "fitting/grouping.py",

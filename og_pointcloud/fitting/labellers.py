@@ -49,13 +49,14 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Labelling:
     """instance_ids: (n,) int32, a row of ``instances``, BACKGROUND or UNOBSERVED. mask_instance: (masks,) int32, the
-    instance that each mask shows, -1 none. certainty: (n,) float32 as of `Membership`; None where views did not decide
-    every point."""
+    instance that each mask shows, -1 none. certainty: (n,) float32, and expected_iou: (K,) float64, as of `Membership`;
+    None where views did not decide every point."""
 
     instance_ids: NDArray[np.int32]
     instances: InstanceTable
     mask_instance: NDArray[np.int32]
     certainty: NDArray[np.float32] | None = None
+    expected_iou: NDArray[np.float64] | None = None
 
     def of_points(self, rows: NDArray[np.integer] | None) -> Labelling:
         """The labelling of other points, each as the point in its row of ``rows``; None: of the same points."""
@@ -225,7 +226,8 @@ def _decided_by_views(
         instances = instances_of_groups(table, mask_instance, ids, len(used))
         if coarse is not None:
             instances = replace(instances, coarse=coarse[looks.group[used]])
-    return Labelling(ids, instances, mask_instance, membership.certainty)
+    expected_iou = membership.expected_iou[looks.group[used]]
+    return Labelling(ids, instances, mask_instance, membership.certainty, expected_iou)
 
 
 def renumbered(

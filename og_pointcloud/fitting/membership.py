@@ -61,11 +61,13 @@ class SceneVotes:
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. certainty: (n,) float32 in [0, 1], how likely views
     make the state that a point is given, times the part of its neighbors that are in it; 0 where no view sees it.
+    expected_iou: (groups,) float64, of the points given to each group with those that are of it, as far as views tell.
     detection_rate: (groups,) float32, the part of a group's visible weight that lies in views that have a mask of it.
     dismissed: (groups,) bool, groups that the scene's views contradict as a whole. scene: what all votes said."""
 
     instance_ids: NDArray[np.int32]
     certainty: NDArray[np.float32]
+    expected_iou: NDArray[np.float64]
     detection_rate: NDArray[np.float32]
     dismissed: NDArray[np.bool_]
     scene: SceneVotes
@@ -106,8 +108,9 @@ def assign_points(
     ids = _completed(likely.ids, support, possible, (table, groups.group), around, weights, settings)
     certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
-        ids, certainty.astype(np.float32), rate.astype(np.float32), dismissed, SceneVotes(typical, reports)
-    )
+        ids, certainty.astype(np.float32), likely.expected_iou(ids), rate.astype(np.float32), dismissed,
+        SceneVotes(typical, reports),
+    )  # fmt: skip
 
 
 def assign_by_votes_alone(

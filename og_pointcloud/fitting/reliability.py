@@ -8,8 +8,10 @@ already. The reliability of an instance is the product of three shares in [0, 1]
             cut otherwise in every view lower it
     named   of its masks, those whose own feature, alone, is nearest to the instance's look. An encoder that errs, and
             masks that span several things, lower it
-    kept    of the points that lie mostly in masks of it, those that it has. Both halves may agree on what is wrong, as
-            rays slip through a surface in all views, or masks hold more than the thing: this is lower even so
+    expected
+            the IoU of its points with all that is of it, where every point is as likely in each state as all views
+            together make it (view_reports.py). Both halves may agree on what is wrong, as rays slip through a surface
+            in all views: this is lower even so, where views contradict them
 
 Instances are of one look where their descriptors are alike once what all masks have in common is taken away: two
 chairs are, and either may be found where the other was. What all views get wrong in the same way, no half can tell.
@@ -26,7 +28,6 @@ from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.labellers import Labelling, grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
@@ -39,8 +40,6 @@ FEWEST_VIEWS = 4
 SAME_LOOK = 0.5
 """Two instances are of one look from this cosine of their descriptors on, taken without what all masks share. Unrelated
 things have about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
-MOSTLY = 0.5
-"""A point lies mostly in masks of an instance with more than this share of what is seen of it: of one instance only."""
 ROWS_AT_ONCE = 1 << 24
 """Cosines held at once: 128 MB in float64."""
 ROWS = 16
@@ -51,18 +50,18 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Reliability:
-    """again, named, kept: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was judged.
-    alone: share of the judged points in instances that one of the halves does not see."""
+    """again, named, expected: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was
+    judged. alone: share of the judged points in instances that one of the halves does not see."""
 
     again: NDArray[np.float64]
     named: NDArray[np.float64]
-    kept: NDArray[np.float64]
+    expected: NDArray[np.float64]
     alone: float
 
     @property
     def of_instance(self) -> NDArray[np.float32]:
         """(K,) their product."""
-        return (self.again * self.named * self.kept).astype(np.float32)
+        return (self.again * self.named * self.expected).astype(np.float32)
 
 
 def split_half(table: MaskTable, surface: Surface, labelling: Labelling, settings: FitSettings) -> Reliability | None:
@@ -79,16 +78,19 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
     looks, count = _Looks(table, labelling.instances), len(labelling.instances)
     points = np.bincount(ids[ids >= 0], minlength=count)
     # Halves of every other view: each then looks at the scene from all around. Either counts half.
-    again, kept, unseen = np.zeros(count), np.zeros(count), np.zeros(len(ids), bool)
+    again, unseen = np.zeros(count), np.zeros(len(ids), bool)
     for half in (masked[0::2], masked[1::2]):
         part = _of_views(table, np.sort(half), sample)
         unseen |= np.asarray(part.exposure.sum(axis=0)).ravel() == 0
         again += _again(ids, _named_by(part, judged, looks, settings), looks, points) / 2
-        kept += _kept(part, labelling.mask_instance[np.isin(table.mask_view, half)], ids, count) / 2
     known = looks.described & (points > 0)
     alone = float(unseen[ids >= 0].mean()) if (ids >= 0).any() else 0.0
-    again, named, kept = (np.where(known, share, np.nan) for share in (again, _named(table, labelling, looks), kept))
-    return Reliability(again, named, kept, alone)
+    # Of points that keep their leaf no view said how likely that is.
+    expected = np.ones(count) if labelling.expected_iou is None else labelling.expected_iou
+    again, named, expected = (
+        np.where(known, share, np.nan) for share in (again, _named(table, labelling, looks), expected)
+    )
+    return Reliability(again, named, expected, alone)
 
 
 class _Looks:
@@ -167,20 +169,6 @@ def _named(table: MaskTable, labelling: Labelling, looks: _Looks) -> NDArray[np.
     count = len(labelling.instances)
     masks = np.bincount(owner[used], minlength=count)
     return np.divide(np.bincount(owner[used], right, count), masks, out=np.ones(count), where=masks > 0)
-
-
-def _kept(table: MaskTable, owner: NDArray[np.int32], ids: NDArray[np.int32], count: int) -> NDArray[np.float64]:
-    """(K,) of the points that lie mostly in masks of an instance, the share that it has; 1 where there is none.
-
-    owner: (masks,) the instance of each mask, -1 none.
-    """
-    # What is seen of each point in masks of each instance: sparse, as a point is in masks of few.
-    by_instance = csr_array(indicator(owner, count) @ table.weights).tocoo()
-    mostly = by_instance.data > MOSTLY * table.seen[by_instance.col]
-    instance, point = by_instance.row[mostly], by_instance.col[mostly]
-    masked = np.bincount(instance, minlength=count)
-    kept = np.bincount(instance, ids[point] == instance, count)
-    return np.divide(kept, masked, out=np.ones(count), where=masked > 0)
 
 
 def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int64]) -> MaskTable:

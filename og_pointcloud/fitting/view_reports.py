@@ -93,6 +93,15 @@ class LikelyStates:
         """(n,) how likely each point is in the state of ``ids``; 0 where that is none it may be in."""
         return _likely_in(self.start, self.state, self.likely, np.where(ids == BACKGROUND, self.background, ids))
 
+    def expected_iou(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(groups,) the IoU that each group's points in ``ids`` have with all that is of it, as far as states are as
+        likely as found; 0 where nothing is."""
+        count, grouped = self.background, ids >= 0
+        of_group = np.bincount(self.state, self.likely, count + 1)[:count]
+        right = np.bincount(ids[grouped], self.of(ids)[grouped], count)
+        either = np.bincount(ids[grouped], minlength=count) + of_group - right
+        return np.divide(right, either, out=np.zeros(count), where=either > 0)
+
 
 def likely_states(
     of_points: VotesOfPoints,

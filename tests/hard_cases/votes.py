@@ -68,15 +68,22 @@ def tied_groups() -> Answer:
 @agrees(0, "seed", tuple(range(8)))
 def membership_of_any_votes(seed: float) -> Answer:
     """Points on a line whose masks are torn at random: the state of each, against the literal form."""
-    ours, (ids, _) = _both(int(seed))
+    ours, (ids, *_) = _both(int(seed))
     return Answer(ours.instance_ids, ids)
 
 
 @agrees(1e-6, "seed", tuple(range(4)))
 def certainty_of_any_votes(seed: float) -> Answer:
     """How sure of it the same points are."""
-    ours, (_, certainty) = _both(int(seed))
+    ours, (_, certainty, _) = _both(int(seed))
     return Answer(ours.certainty, certainty)
+
+
+@agrees(1e-6, "seed", tuple(range(4)))
+def expected_iou_of_any_votes(seed: float) -> Answer:
+    """How much of each group is expected to be right."""
+    ours, (*_, expected) = _both(int(seed))
+    return Answer(ours.expected_iou, expected)
 
 
 @agrees(0, "seed", tuple(range(4)))
@@ -84,7 +91,7 @@ def borders_by_color(seed: float) -> Answer:
     """Points hear each neighbor as far as its color speaks for one thing."""
     random = np.random.default_rng(int(seed))
     rgb = np.clip(3 * np.arange(POINTS)[:, None] + random.normal(0, 9, (POINTS, 3)), 0, 255).astype(np.uint8)
-    ours, (ids, _) = _both(int(seed), rgb)
+    ours, (ids, *_) = _both(int(seed), rgb)
     return Answer(ours.instance_ids, ids)
 
 
@@ -183,7 +190,7 @@ def _assigned(
     return assign_points(table, view_votes(table), groups, around, MembershipSettings(), rgb)
 
 
-def _both(seed: int, rgb: NDArray[np.uint8] | None = None) -> tuple[Membership, tuple[NDArray, NDArray]]:
+def _both(seed: int, rgb: NDArray[np.uint8] | None = None) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
     """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask; the
     last mask is of none."""
     table = _table(seed)
