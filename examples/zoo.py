@@ -3,25 +3,30 @@
     python examples/zoo.py -o out/zoo                                    # all made scenes
     python examples/zoo.py -o out/zoo --captures CAPTURE [CAPTURE ...]   # and captures with gt.npz, text_features.npz
     python examples/zoo.py -o out/zoo --half choose --set membership.sure_share=0.5 --quick
+    python examples/zoo.py -o out/zoo --half judge --worse views=5 poses=2  # from less (og_pointcloud_zoo/worse.py)
+    python examples/zoo.py -o out/zoo --only desk room --needs           # from less and less of each, as a table
     python examples/zoo.py -o out/zoo --constants docs/constants.md      # each number at half and at twice its value
 
 Scenes are made once, in OUT/scenes. Beside each fit stand the best of the baselines of
 `og_pointcloud.evaluate.baselines`, the difference with its 95 % interval over blocks of space, and how well the fit
-thinks that it did. Writes OUT/zoo.csv and OUT/zoo.png. Which half a scene is of, its name alone decides.
+thinks that it did. Writes OUT/zoo.csv and OUT/zoo.png; --needs writes OUT/needs.csv and OUT/needs.png. Which half a
+scene is of, its name alone decides.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from og_pointcloud_zoo.constants import constants, page, tried
 from og_pointcloud_zoo.draws import draw, is_chosen, scene_names
 from og_pointcloud_zoo.make import made_scene
-from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings
-from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
+from og_pointcloud_zoo.measure import Row, measure, parsed, parsed_settings
+from og_pointcloud_zoo.report import HALVES, HEADER, line, needs_table, summary, write_csv, write_needs, write_picture
+from og_pointcloud_zoo.worse import LADDER, WAYS
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.sweep import warm_up
@@ -37,7 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes whose name begins so")
     parser.add_argument("--half", choices=tuple(HALVES), help="only this half")
     parser.add_argument("--set", nargs="+", default=[], metavar="PATH=VALUE", help="settings of the fit")
-    parser.add_argument("--colors", choices=COLORS, help="points' colors with noise, without hue too, or none")
+    parser.add_argument("--worse", nargs="+", default=[], metavar="KIND=AMOUNT", help=f"kinds: {', '.join(WAYS)}")
+    parser.add_argument("--needs", action="store_true", help="each kind by several amounts")
     parser.add_argument("--quick", action="store_true", help="without baselines")
     parser.add_argument("--constants", type=Path, metavar="PAGE", help="write the page of constants (--only: of some)")
     parser.add_argument("--list", action="store_true", help="print the scenes as drawn, and make none")
@@ -53,7 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print("\n".join(str(draw(path.name)) for path in chosen if path.name in scene_names()))
         return
     try:
-        _report(_rows(chosen, options), options.output)
+        if options.needs:
+            _needs(chosen, options)
+        else:
+            _report(_rows(chosen, options, parsed(options.worse)), options.output)
     except OgPointcloudError as error:
         sys.exit(f"zoo: {error}")
 
@@ -66,16 +75,24 @@ def _write_constants(options: argparse.Namespace) -> None:
     print(write_file(options.constants, page(results).encode()))
 
 
-def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:
+def _needs(paths: Sequence[Path], options: argparse.Namespace) -> None:
+    rows, file = [], options.output / "needs.csv"
+    for change in ({}, *({kind: amount} for kind, amounts in LADDER.items() for amount in amounts)):
+        rows += _rows(paths, options, change)
+        write_csv(rows, file)  # what is measured stays, should it be interrupted
+    print(f"\n{needs_table(rows)}\n\n{file}\n{write_needs(rows, options.output / 'needs.png')}")
+
+
+def _rows(paths: Sequence[Path], options: argparse.Namespace, changes: Mapping[str, Any]) -> list[Row]:
     settings, rows = parsed_settings(options.set), []
     print(HEADER)
-    for path in chosen:
+    for path in paths:
         folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
         if not rows:
             warm_up(read_capture(folder))
-        rows.append(measure(folder, settings, baselines=not options.quick, colors=options.colors))
+        rows.append(measure(folder, settings, baselines=not options.quick, changes=changes))
         print(line(rows[-1]), flush=True)
-        write_csv(rows, options.output / "zoo.csv")  # what is measured stays, should it be interrupted
+        write_csv(rows, options.output / "zoo.csv")
     return rows
 
 

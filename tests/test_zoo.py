@@ -12,13 +12,15 @@ from og_pointcloud_room.raycast import Intrinsics
 from og_pointcloud_zoo import constants as numbers
 from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
-from og_pointcloud_zoo.measure import COLOR_NOISE, COLORS, Row, _recolored, measure, parsed_settings
+from og_pointcloud_zoo.measure import Row, measure, parsed_settings
 from og_pointcloud_zoo.outdoors import Matched, Scanner, street_room
 from og_pointcloud_zoo.report import summary
+from og_pointcloud_zoo.worse import COLOR_NOISE, COLORS, worse
+from scipy.spatial import cKDTree
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting import view_votes
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.rendering import sightings
@@ -307,10 +309,73 @@ def test_colors_that_say_less_leave_all_else_as_it_is():
     camera = og.Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
     view = View("a", camera, np.ones((8, 8), np.int32), np.eye(1, dtype=np.float32))
     scene = Scene(Points(np.zeros((4000, 3), np.float32), np.zeros(3), rgb), (view,), "none")
-    noisy, grey, none = (_recolored(scene, colors).points.rgb for colors in COLORS)
+    truth = Truth(np.zeros(4000, int), ("a",), np.ones(4000, bool), None)
+    noisy, grey, none = (worse(scene, truth, "colors", colors)[0].points.rgb for colors in COLORS)
     assert none is None
     inside = (rgb > 90) & (rgb < 165)
     assert (noisy.astype(float) - rgb)[inside].std() == pytest.approx(COLOR_NOISE, rel=0.1)
     assert np.abs(np.corrcoef(grey.astype(float) - rgb.mean(axis=1, keepdims=True), rowvar=False)[0, 1]) < 0.1
-    assert np.array_equal(noisy, _recolored(scene, "noisy").points.rgb)
-    assert _recolored(scene, None) is scene
+    assert np.array_equal(noisy, worse(scene, truth, "colors", "noisy")[0].points.rgb)
+
+
+def test_a_scene_is_made_worse_by_as_much_as_asked(scenes):
+    scene, truth = read_capture(scenes[0]), read_truth(scenes[0])
+    n, xyz = TINY.points, scene.points.xyz
+
+    fewer, same = worse(scene, truth, "views", 3)
+    assert [view.name for view in fewer.views] == [scene.views[k].name for k in (0, 2, 5)]
+    assert same is truth
+
+    thin, of_thin = worse(scene, truth, "points", 0.2)
+    rows = [int(np.flatnonzero((xyz == one).all(axis=1))[0]) for one in thin.points.xyz]
+    assert len(set(rows)) == n // 5
+    for name in ("cls", "scored", "background", "instance"):
+        assert np.array_equal(getattr(of_thin, name), getattr(truth, name)[rows]), name
+
+    noisy = worse(scene, truth, "noise", 2)[0].points.xyz - xyz
+    spacing = np.median(cKDTree(xyz).query(xyz, 2)[0][:, 1])
+    assert noisy.std(axis=0) == pytest.approx([2 * spacing] * 3, rel=0.1)
+
+    strays, of_strays = worse(scene, truth, "strays", 0.1)
+    assert np.array_equal(strays.points.xyz[:n], xyz)
+    assert np.array_equal(of_strays.cls[:n], truth.cls)
+    assert len(strays.points) == len(of_strays.cls) == n * 11 // 10
+    assert (of_strays.cls[n:] == -1).all()
+    assert not (of_strays.scored | of_strays.background)[n:].any()
+
+    off = worse(scene, truth, "poses", 3)[0]
+    for view, before in zip(off.views, scene.views, strict=True):
+        camera = before.camera
+        middle = camera.center + camera.world_to_camera[2, :3]  # on the optical axis: the middle of the image
+        moved = view.camera.project(middle[None])[0] - camera.project(middle[None])[0]
+        assert np.linalg.norm(moved) == pytest.approx(3, rel=0.01)
+
+    missing = worse(scene, truth, "masks", 0.5)[0]
+    for view, before in zip(missing.views, scene.views, strict=True):
+        ids, old = view.mask_map(), before.mask_map()
+        assert view.mask_count < before.mask_count or before.mask_count < 4
+        for k in np.unique(ids[ids >= 0]):
+            whole = np.unique(old[ids == k])
+            assert len(whole) == 1
+            assert ((old == whole[0]) == (ids == k)).all()
+            assert np.array_equal(view.mask_features[k], before.mask_features[whole[0]])
+
+
+@pytest.mark.parametrize("change", ["views=0", "points=1.5", "masks=no", "colors=blue", "light=1"])
+def test_what_makes_nothing_worse_is_told(scenes, tmp_path, change, capsys):
+    with pytest.raises(SystemExit, match=f"'{change}' makes nothing worse; expected one of views, points"):
+        zoo.main(["-o", str(tmp_path), "--captures", str(scenes[0]), "--only", "tiny", "--worse", change])
+
+
+def test_what_a_capture_needs_is_a_table_and_a_plot(scenes, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(zoo, "LADDER", {"views": (3,), "poses": (40,)})
+    zoo.main(["-o", str(tmp_path), "--captures", str(scenes[0]), "--only", "tiny", "--needs"])
+    with (tmp_path / "needs.csv").open() as file:
+        rows = {row["worse"]: row for row in csv.DictReader(file)}
+    assert list(rows) == ["", "views=3", "poses=40"]
+    as_it_is = measure(scenes[0], baselines=False)
+    assert float(rows[""]["miou"]) == pytest.approx(as_it_is.miou)
+    assert float(rows["poses=40"]["miou"]) < as_it_is.miou - 0.2  # of 96 pixels
+    said = capsys.readouterr().out
+    assert f"| as it is | {as_it_is.miou:.3f} | {float(rows['']['baseline_miou']):.3f} |" in said
+    assert (tmp_path / "needs.png").stat().st_size > 5000

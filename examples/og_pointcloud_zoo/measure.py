@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,22 +23,19 @@ from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud_zoo.draws import half_of
+from og_pointcloud_zoo.worse import worse
 
 WORDS, BANK = "text_features.npz", "word_bank.npz"
-COLORS = ("noisy", "grey", "none")
-"""Colors with noise, the same without hue, and none."""
-COLOR_NOISE = 30.0
-"""Standard deviation of that noise, of 255 levels: made colors are cleaner than those of a scan."""
 
 
 @dataclass(frozen=True)
 class Row:
     """One scene. miou, background, unknown: as `Score` has them. seconds: of the fit, capture in memory;
-    core_seconds: of all cores together, which other work on the machine changes less.
+    core_seconds: of all cores together, which other work on the machine changes less. worse: how the scene was made
+    worse before, as "views=5".
 
     reliability: what the fit says of itself, in [0, 1]. baseline: the best one, None where none was asked for; gain:
     our mIoU less its, over the same blocks of space, and the middle 95 % of that.
@@ -54,6 +51,7 @@ class Row:
     seconds: float
     core_seconds: float
     reliability: float | None
+    worse: str = ""
     baseline: str | None = None
     baseline_miou: float | None = None
     gain: float | None = None
@@ -62,13 +60,15 @@ class Row:
 
 
 def measure(
-    folder: Path, settings: FitSettings | None = None, baselines: bool = True, colors: str | None = None
+    folder: Path, settings: FitSettings | None = None, baselines: bool = True, changes: Mapping[str, Any] | None = None
 ) -> Row:
     """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table.
 
-    colors: one of `COLORS`, None: as they are.
+    changes: kind -> amount by which the capture is made worse before (`worse`).
     """
-    scene, truth = _recolored(read_capture(folder), colors), read_truth(folder)
+    scene, truth = read_capture(folder), read_truth(folder)
+    for kind, amount in (changes or {}).items():
+        scene, truth = worse(scene, truth, kind, amount)
     start, worked = time.perf_counter(), time.process_time()
     journal = Journal(progress=False)
     prepared = prepare(scene, settings, journal)
@@ -87,21 +87,9 @@ def measure(
         seconds=seconds,
         core_seconds=worked,
         reliability=cloud.reliability,
+        worse=" ".join(f"{kind}={amount}" for kind, amount in (changes or {}).items()),
     )
     return _beside_baselines(row, folder, prepared, answer, truth, score.classes) if baselines else row
-
-
-def _recolored(scene: Scene, colors: str | None) -> Scene:
-    """The scene with colors that say less; always the same."""
-    rgb = scene.points.rgb
-    if colors is None or rgb is None:
-        return scene
-    found = None
-    if colors != "none":
-        exact = rgb.astype(np.float64) if colors == "noisy" else np.repeat(rgb.mean(axis=1, keepdims=True), 3, axis=1)
-        noise = np.random.default_rng(0).normal(0, COLOR_NOISE, rgb.shape)
-        found = np.clip(exact + noise, 0, 255).astype(np.uint8)
-    return replace(scene, points=replace(scene.points, rgb=found))
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
@@ -130,13 +118,20 @@ def _beside_baselines(
 def parsed_settings(changes: Iterable[str]) -> FitSettings:
     """Settings with numbers changed by ``path=value``, as "membership.sure_share=0.5" or "mode=grouping"."""
     found = FitSettings()
-    for change in changes:
-        path, _, text = change.partition("=")
-        value: Any = text
-        with suppress(ValueError, SyntaxError):
-            value = ast.literal_eval(text)
+    for path, value in parsed(changes).items():
         try:
             found = changed(found, path, value)
         except (AttributeError, TypeError):
             raise OgPointcloudError(f"'{path}' is no setting; expected a path like membership.sure_share=0.5") from None
+    return found
+
+
+def parsed(changes: Iterable[str]) -> dict[str, Any]:
+    """Values by name of ``name=value``: numbers where they are some, else text."""
+    found: dict[str, Any] = {}
+    for change in changes:
+        name, _, value = change.partition("=")
+        found[name] = value
+        with suppress(ValueError, SyntaxError):
+            found[name] = ast.literal_eval(value)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -66,6 +66,44 @@ def _means(rows: Sequence[Row]) -> str:
     if len(said) > 2:
         text += f"; rank correlation of reliability and mIoU {spearmanr(said).statistic:.2f}"
     return text
+
+
+def needs_table(rows: Sequence[Row]) -> str:
+    """Means over the scenes, of each way and amount in which they were made worse, in its order: Markdown."""
+    text = "| made worse | mIoU | best baseline | background called | unknown | reliability |\n"
+    text += "| --- | ---: | ---: | ---: | ---: | ---: |\n"
+    for worse in dict.fromkeys(row.worse for row in rows):
+        of = [row for row in rows if row.worse == worse]
+        figures = [_mean([getattr(row, name) for row in of]) for name in ("miou", "baseline_miou")]
+        figures.append(_mean([row.background for row in of], "{:.1%}"))
+        figures += [_mean([getattr(row, name) for row in of]) for name in ("unknown", "reliability")]
+        text += f"| {worse or 'as it is'} | {' | '.join(figures)} |\n"
+    return text
+
+
+def _mean(values: Iterable[float | None], form: str = "{:.3f}") -> str:
+    known = [value for value in values if value is not None]
+    return form.format(np.mean(known)) if known else "-"
+
+
+def write_needs(rows: Sequence[Row], path: Path) -> Path:
+    """Mean mIoU, ours and of the best baselines, against how much worse the scenes were made: a plot for each way."""
+    kinds = dict.fromkeys(row.worse.partition("=")[0] for row in rows if row.worse)
+    figure = require_matplotlib()(figsize=(4 * len(kinds), 3.5), layout="constrained")
+    for axes, kind in zip(figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0], kinds, strict=True):
+        steps = ["", *dict.fromkeys(row.worse for row in rows if row.worse.startswith(f"{kind}="))]
+        for label, of in (("ours", lambda row: row.miou), ("best baseline", lambda row: row.baseline_miou)):
+            means = [[of(row) for row in rows if row.worse == step and of(row) is not None] for step in steps]
+            if all(means):
+                axes.plot(range(len(steps)), [np.mean(values) for values in means], marker="o", label=label)
+        axes.set_xticks(range(len(steps)), ["as it is", *(step.partition("=")[2] for step in steps[1:])])
+        axes.set(title=kind, ylim=(0, 1))
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("mean mIoU")
+    figure.axes[0].legend(fontsize=8, frameon=False)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=110)
+    return path
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
