@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.scene import Camera, brief, require_finite
+from og_pointcloud.scene import Camera, brief, require_finite, take_arrays
 
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
@@ -100,6 +100,7 @@ class InstanceTable:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        take_arrays(self, *(each.name for each in fields(self)))
         count = len(self.points)
         # Frozen, so by object.__setattr__: what was left empty becomes "unknown" in every row.
         for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
@@ -190,6 +191,7 @@ class Vocabulary:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        take_arrays(self, "vectors")
         if self.vectors.ndim != 2 or len(self.vectors) != len(self.names):
             raise OgPointcloudError(
                 f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; "
@@ -286,6 +288,7 @@ class LabelledCloud:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        take_arrays(self, "xyz", "origin", "instance_ids", "rgb", "certainty")
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.origin.shape != (3,) or self.instance_ids.shape != (n,):
             raise OgPointcloudError(

@@ -59,6 +59,17 @@ def _brief(value: Any) -> str:
     return "<read when asked for>" if callable(value) else repr(value)
 
 
+def take_arrays(record: Any, *names: str) -> None:
+    """Make arrays of what a frozen record was given as lists, in these of its fields; SceneError for ragged ones."""
+    for name in names:
+        value = getattr(record, name)
+        if isinstance(value, list | tuple):
+            try:
+                object.__setattr__(record, name, np.asarray(value))
+            except ValueError:
+                raise SceneError(f"{name} is {value!r:.80}; expected an array: its rows differ in length") from None
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera without distortion.
@@ -186,6 +197,7 @@ class View:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise SceneError(f"a view is called {self.name!r:.80}; expected text, as its image's file stem is")
+        take_arrays(self, "mask_features", "mask_tracks")
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
@@ -299,6 +311,7 @@ class Points:
         return cls((world - origin).astype(np.float32), origin, rgb, scale, rotation, opacity)
 
     def __post_init__(self) -> None:
+        take_arrays(self, "xyz", "origin", "rgb", "scale", "rotation", "opacity")
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.xyz.dtype != np.float32 or np.shape(self.origin) != (3,):
             raise SceneError(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
 from og_pointcloud.scene import Camera, Points, Scene, View
 
@@ -104,3 +106,28 @@ def test_views_without_a_name_and_scenes_without_a_point_are_refused():
         _view(name=3)
     with pytest.raises(SceneError, match="the scene has 0 points; expected at least one"):
         Scene(Points(np.zeros((0, 3), np.float32), np.zeros(3)), (_view(),), "letters")
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda view: Points([[0, 0, 0.0]], [0, 0, 0]), r"xyz is float64 \(1, 3\).* Points.from_world\(xyz\) makes"),
+        (lambda view: Points(np.zeros((1, 3), np.float32), [0, 0, 0], [[1, 2, 3]]), "rgb is int64; expected uint8"),
+        (lambda view: replace(view, mask_features=[[1.0, 0]]), r"float64 \(1, 2\); .*pass features.astype"),
+        (lambda view: replace(view, mask_features=[[1.0], [1.0, 0]]), "mask_features is .*rows differ in length"),
+        (lambda view: replace(view, mask_tracks=[0.5] * view.mask_count), "mask tracks are float64"),
+        (lambda view: Vocabulary(("a",), [["x", 0]]), "vocabulary vectors is <U21; expected float32"),
+        (lambda view: Vocabulary(("a", "b"), [[1, 0]]), "2 names and vectors of shape"),
+    ],
+)
+def test_lists_are_told_as_the_arrays_that_they_are(made, said):
+    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
+    view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32))
+    with pytest.raises(OgPointcloudError, match=said):
+        made(view)
+
+
+def test_lists_of_what_is_right_are_taken():
+    points = Points(np.zeros((2, 3), np.float32), [1, 2, 3])
+    assert points.origin.tolist() == [1, 2, 3]
+    assert Vocabulary(("a",), [[1, 0]]).vectors.dtype == np.float32
