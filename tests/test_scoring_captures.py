@@ -9,7 +9,7 @@ import pytest
 from labelled_clouds import make_cloud, unit_rows
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.evaluate import intervals
 from og_pointcloud.evaluate.captures import Answer, ask, score_capture
 from og_pointcloud.evaluate.intervals import bootstrap, miou_interval
@@ -240,3 +240,9 @@ def test_a_scene_is_asked_for_the_names(tmp_path):
     assert found.called.tolist() == [0, 1, -1, 1]
     with pytest.raises(SceneError, match="has 4 points, the truth 3"):
         ask(scene, truth_of([0, 1, 1]), tmp_path / "w.npz")
+
+
+def test_an_interval_over_no_class_is_refused_not_waited_for():
+    truth = Truth(np.full(40, -1), ("a",), np.ones(40, bool), np.ones(40, bool))
+    with pytest.raises(OgPointcloudError, match="no class has points enough"):
+        miou_interval(np.full(40, -1), truth, np.random.default_rng(0).normal(size=(40, 3)), 0.1, ())

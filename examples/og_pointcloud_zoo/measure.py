@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
@@ -23,6 +24,7 @@ from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
+from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud_zoo.draws import half_of
@@ -64,17 +66,21 @@ def measure(
 ) -> Row:
     """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table.
 
-    changes: kind -> amount by which the capture is made worse before (`worse`).
+    changes: kind -> amount by which the capture is made worse before (`worse`). It is scored at its own points: those
+    that were left out are labelled as the nearest that was not.
     """
-    scene, truth = read_capture(folder), read_truth(folder)
+    capture, truth = read_capture(folder), read_truth(folder)
+    scene = capture
     for kind, amount in (changes or {}).items():
-        scene, truth = worse(scene, truth, kind, amount)
+        scene = worse(scene, kind, amount)
     start, worked = time.perf_counter(), time.process_time()
     journal = Journal(progress=False)
     prepared = prepare(scene, settings, journal)
     cloud = fit_prepared(prepared, settings, journal)
     seconds, worked = time.perf_counter() - start, time.process_time() - worked
-    answer = answered(folder, cloud, truth)
+    at = _place_of_points(capture, scene)
+    at_points = replace(cloud, xyz=capture.points.xyz, instance_ids=cloud.instance_ids[at], rgb=None, certainty=None)
+    answer = answered(folder, at_points, truth)
     score = truth.score(answer.called)
     row = Row(
         scene=folder.name,
@@ -89,7 +95,13 @@ def measure(
         reliability=cloud.reliability,
         worse=" ".join(f"{kind}={amount}" for kind, amount in (changes or {}).items()),
     )
-    return _beside_baselines(row, folder, prepared, answer, truth, score.classes) if baselines else row
+    return _beside_baselines(row, folder, prepared, at, answer, truth, score.classes) if baselines else row
+
+
+def _place_of_points(capture: Scene, scene: Scene) -> NDArray[np.integer]:
+    """(n,) the point of a worse scene whose label each of the capture's points has."""
+    xyz, left = capture.points.xyz, scene.points.xyz
+    return np.arange(len(xyz)) if len(left) >= len(xyz) else np.asarray(cKDTree(left).query(xyz)[1])
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
@@ -101,12 +113,13 @@ def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
 
 
 def _beside_baselines(
-    row: Row, folder: Path, prepared: Prepared, answer: Answer, truth: Truth, classes: tuple[int, ...]
-) -> Row:
+    row: Row, folder: Path, prepared: Prepared, at: NDArray[np.integer], answer: Answer, truth: Truth,
+    classes: tuple[int, ...],
+) -> Row:  # fmt: skip
     vocabulary = read_text_features(folder / WORDS)[0]
     best: tuple[float, str, NDArray[np.integer]] | None = None
     for name, labels, _ in baseline_labels(prepared, vocabulary.vectors):
-        called = truth.class_of(labels, vocabulary.names)
+        called = truth.class_of(labels[at], vocabulary.names)
         miou = truth.score(called).miou
         if best is None or miou > best[0]:
             best = miou, name, called

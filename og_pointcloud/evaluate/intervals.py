@@ -72,8 +72,10 @@ def miou_interval(
     labelling's. Both are then scored on the same draws, since what is hard for one is hard for the other.
 
     called, less: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points,
-    same unit. classes: those that the score is a mean over, one or more.
+    same unit. classes: those that the score is a mean over; OgPointcloudError without one.
     """
+    if not classes:
+        raise OgPointcloudError("no class has points enough to be scored, so their mean has no interval; expected one")
     evaluated = truth.scored & np.isin(truth.cls, classes)
     counted = evaluated if truth.background is None else evaluated | truth.background
     points, true = np.asarray(xyz, np.float64)[counted], np.where(evaluated, truth.cls, -1)[counted]
