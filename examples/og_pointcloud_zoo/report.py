@@ -16,6 +16,14 @@ from og_pointcloud_zoo.measure import Row
 
 HALVES = {"choose": "for choosing", "judge": "for judging alone"}
 COLORS = {"choose": "tab:blue", "judge": "tab:orange"}
+UNITS = {
+    "views": "views",
+    "points": "points, share kept",
+    "noise": "noise of points, spacings",
+    "strays": "strays, share of points",
+    "poses": "poses off by, pixels",
+    "masks": "masks missing, share",
+}
 SHOWN = 5
 
 
@@ -88,21 +96,21 @@ def _mean(values: Iterable[float | None], form: str = "{:.3f}") -> str:
 
 def write_needs(rows: Sequence[Row], path: Path) -> Path:
     """Mean mIoU, ours and of the best baselines, against how much worse the scenes were made: a plot for each way."""
-    kinds = dict.fromkeys(row.worse.partition("=")[0] for row in rows if row.worse)
-    figure = require_matplotlib()(figsize=(4 * len(kinds), 3.5), layout="constrained")
-    for axes, kind in zip(figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0], kinds, strict=True):
+    kinds = list(dict.fromkeys(row.worse.partition("=")[0] for row in rows if row.worse))
+    figure = require_matplotlib()(figsize=(11, 6), layout="constrained")
+    of_kind = figure.subplots(2, -(-len(kinds) // 2), sharey=True, squeeze=False).ravel()
+    for axes, kind in zip(of_kind, kinds, strict=False):
         steps = ["", *dict.fromkeys(row.worse for row in rows if row.worse.startswith(f"{kind}="))]
-        for label, of in (("ours", lambda row: row.miou), ("best baseline", lambda row: row.baseline_miou)):
-            means = [[of(row) for row in rows if row.worse == step and of(row) is not None] for step in steps]
-            if all(means):
+        for label, name in (("ours", "miou"), ("best baseline", "baseline_miou")):
+            means = [[getattr(row, name) for row in rows if row.worse == step] for step in steps]
+            if None not in means[0]:
                 axes.plot(range(len(steps)), [np.mean(values) for values in means], marker="o", label=label)
         axes.set_xticks(range(len(steps)), ["as it is", *(step.partition("=")[2] for step in steps[1:])])
-        axes.set(title=kind, ylim=(0, 1))
+        axes.set(title=UNITS.get(kind, kind), ylim=(0, 1), ylabel="mean mIoU" if axes in of_kind[::3] else "")
         axes.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("mean mIoU")
-    figure.axes[0].legend(fontsize=8, frameon=False)
+    of_kind[0].legend(fontsize=9, frameon=False)
     with replacing(path) as file:
-        figure.savefig(file, format="png", dpi=110)
+        figure.savefig(file, format="png", dpi=100)
     return path
 
 
