@@ -55,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = [path for path in paths if is_chosen(path.name, options.half, options.only)]
     if not chosen:
         parser.error(f"no scene begins with {', '.join(options.only)}; expected one of {', '.join(scene_names())}")
+    if options.needs and options.worse:
+        parser.error("--needs makes scenes worse in its own ways: give it without --worse")
     if options.list:
         print("\n".join(str(draw(path.name)) for path in chosen if path.name in scene_names()))
         return

@@ -376,6 +376,12 @@ def test_what_makes_nothing_worse_is_told(scenes, tmp_path, change, capsys):
         zoo.main(["-o", str(tmp_path), "--captures", str(scenes[0]), "--only", "tiny", "--worse", change])
 
 
+def test_what_a_capture_needs_is_asked_alone(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        zoo.main(["-o", str(tmp_path), "--needs", "--worse", "views=3"])
+    assert "give it without --worse" in capsys.readouterr().err
+
+
 def test_what_a_capture_needs_is_a_table_and_a_plot(scenes, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(zoo, "LADDER", {"views": (3,), "poses": (40,)})
     zoo.main(["-o", str(tmp_path), "--captures", str(scenes[0]), "--only", "tiny", "--needs"])
