@@ -55,10 +55,10 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
 
 def membership(
     votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbors: list[list[int]],
-    settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None,
+    settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None, spanning: Sequence[int] = (),
 ) -> tuple[Ids, Array, Array]:  # fmt: skip
     """Ids and certainty of every point, and the expected IoU of every group. weights: (masks, n) pixels; neighbors: of
-    each point, nearest first; rgb: (n, 3)."""
+    each point, nearest first; rgb: (n, 3); spanning: masks without a group that show several."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
     views_of: dict[int, list[int]] = {}
@@ -115,9 +115,13 @@ def membership(
         apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
         alike = color_ratios(rgb, clear, sureness, neighbors)[np.rint(apart).astype(int)]
     reporting = [k if k in kept else -1 for k in group]
-    likely = _likely_states(votes, mask_view, reporting, count, clear, best, open_, neighbors, alike)
+    background = count + len(spanning)
+    for number, mask in enumerate(spanning, count):
+        reporting[mask] = number
+    sizes = count, background
+    likely = _likely_states(votes, mask_view, reporting, sizes, clear, best, open_, neighbors, alike)
     ids = np.array([min(of, key=lambda k: (-of[k], k)) if of else UNOBSERVED for of in likely], np.int32)
-    ids[ids == count] = BACKGROUND
+    ids[ids == background] = BACKGROUND
     possible = (best >= 0) & (share > settings.possible_share) & (openly > settings.possible_openly)
     while True:  # a middling share counts where it adjoins points that are in already
         beside = [sum(alike[g, other] for other in neighbors[g] if ids[other] == best[g]) for g in points]
@@ -128,7 +132,7 @@ def membership(
         ids[joins] = best[joins]
     ids = _filled(_without_islands(ids, share, weights, group, neighbors, settings.island_share), neighbors)
     agreeing = [np.mean([ids[other] == ids[g] for other in neighbors[g]]) if neighbors[g] else 1.0 for g in points]
-    of_state = [likely[g].get(count if ids[g] == BACKGROUND else int(ids[g]), 0.0) for g in points]
+    of_state = [likely[g].get(background if ids[g] == BACKGROUND else int(ids[g]), 0.0) for g in points]
     expected = np.zeros(count)
     for k in range(count):
         right = sum(of_state[g] for g in points if ids[g] == k)
@@ -138,24 +142,28 @@ def membership(
 
 
 def _likely_states(
-    votes: Votes, mask_view: Sequence[int], group: Sequence[int], background: int, clear: Ids, best: Ids, open_: Array,
-    neighbors: list[list[int]], alike: Array,
+    votes: Votes, mask_view: Sequence[int], group: Sequence[int], sizes: tuple[int, int], clear: Ids, best: Ids,
+    open_: Array, neighbors: list[list[int]], alike: Array,
 ) -> list[dict[int, float]]:  # fmt: skip
-    """Of each point, how likely it is in each state that it may be in; the last number is background's."""
+    """Of each point, how likely it is in each state that it may be in. sizes: groups, and background's number; between
+    them are those of masks that span several groups."""
     from og_pointcloud.fitting import view_reports as by  # needs more than a reference of choosing may
 
-    views, points = len(votes.weight), range(len(clear))
+    background, views, points = sizes[1], len(votes.weight), range(len(clear))
     said = np.zeros((views, background + 1, len(clear)))  # what each view reports of each point; the last: no mask
     no_group = np.zeros_like(votes.weight)
     for mask, view in enumerate(mask_view):
         (said[view, group[mask]] if group[mask] >= 0 else no_group[view])[:] += votes.inside[mask]
     said[:, background] = np.maximum(votes.weight - no_group - said.sum(axis=1), 0)
     shown = {(view, k) for view, k in zip(mask_view, group, strict=True) if k >= 0}
+    within = {s: {int(clear[g]) for g in points if clear[g] >= 0 and said[:, s, g].any()} for s in range(*sizes)}
     may: list[set[int]] = []
+    in_masks: list[set[int]] = []
     for g in points:
         near = {int(best[other]) for other in neighbors[g] if best[other] >= 0}
-        in_masks = {k for k in range(background) if said[:, k, g].any()}
-        may.append({*in_masks, *near, background} if votes.weight[:, g].any() else set())
+        reported = [k for k in range(background) if said[:, k, g].any()]
+        in_masks.append({k for r in reported for k in within.get(r, [r])})
+        may.append({*in_masks[g], *near, background} if votes.weight[:, g].any() else set())
     likely = [{k: float(k == (background if clear[g] == BACKGROUND else clear[g])) for k in may[g]} for g in points]
     for _ in range(by.COUNTED):
         chance = np.zeros((views, background + 1, background + 1))
@@ -173,7 +181,7 @@ def _likely_states(
                 for view in np.flatnonzero(sees):
                     part = said[view, :, g] / said[view, :, g].sum()
                     total += part @ np.log(sees[view] * chance[view, k] + (1 - sees[view]) * by.HIDDEN)
-                prior = by.MORE_LIKELY if k == background else 0 if said[:, k, g].any() else -by.UNSEEN
+                prior = by.MORE_LIKELY if k == background else 0 if k in in_masks[g] else -by.UNSEEN
                 of_point[k] = total / max(1, sees.sum() / by.ENOUGH) + prior
             evidence.append(of_point)
         likely = [dict.fromkeys(of, 0.0) for of in may]

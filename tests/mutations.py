@@ -34,6 +34,7 @@ def trust(*names: str) -> tuple[str, ...]:
 
 
 MEMBERSHIP = hard("votes-borders_by_color", "votes-membership_of_any_votes", "votes-certainty_of_any_votes")
+SPANNING = (*hard("votes-spanning_masks_of_any_votes"), "test_view_reports.py")
 CHOOSING = hard("choosing-nearly_equal_labels", "choosing-label_among_the_bank", "choosing-equal_labels")
 
 MUTATIONS = (
@@ -104,6 +105,14 @@ MUTATIONS = (
     Mutation(
         "what lies in a mask without a group lies in none", "fitting/view_reports.py",
         "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)", MEMBERSHIP,
+    ),
+    Mutation(
+        "a mask that spans several things says nothing", "fitting/membership.py",
+        "groups.count + np.arange(np.count_nonzero(groups.spanning))", "-1", SPANNING,
+    ),
+    Mutation(
+        "a mask that spans several things speaks of what adjoins alone", "fitting/view_reports.py",
+        "if k >= groups else range(0)", "if False else range(0)", SPANNING,
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",

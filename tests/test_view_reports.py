@@ -15,6 +15,7 @@ from test_membership import decide, groups, on_a_line, torn_case
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting import view_votes as votes_module
+from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import Membership, assign_points
 from og_pointcloud.fitting.view_reports import EXPECTED, LEAST
@@ -73,6 +74,22 @@ def test_points_that_adjoin_an_instance_may_be_of_it_though_no_mask_of_it_holds_
     found = decide(hand_table(N, views), [0, -1] * 2)
     assert found.instance_ids.tolist() == [0] * 56 + [BACKGROUND] * 4
     assert (found.certainty[57:] < found.certainty[10]).all()
+
+
+@pytest.mark.parametrize("spans", [range(N), range(50)])
+def test_what_a_mask_that_spans_two_things_alone_shows_is_of_one_of_them(spans: range) -> None:
+    """Three views know two things, but do not see where they meet. A fourth sees all, and shows both as one."""
+    views: list[HandView] = [[(range(30), ONE), (range(30, N), OTHER)]] * 3
+    table = hand_table(N, [*views, [(spans, ONE)]], [range(20, 40)] * 3)
+    numbers, spanning = np.array([0, 1] * 3 + [-1], np.int32), np.arange(7) == 6
+    around = neighborhood(on_a_line(N), GeometrySettings())
+    found = assign_points(table, view_votes(table), MaskGroups(numbers, 2, spanning), around, MembershipSettings())
+    ids = found.instance_ids.tolist()
+    assert ids == sorted(ids)
+    assert set(ids[:26]) == {0}
+    assert set(ids[-22:]) == {1}
+    assert found.expected_iou.shape == (2,)
+    assert found.scene.reports.spanned.tolist() == [[True, True]]
 
 
 @pytest.mark.parametrize("numbers", [[], [-1] * 3])

@@ -99,8 +99,9 @@ def assign_points(
     openly = _openly(votes.openness, settings.open_share * typical)
     clear = _clear(support, openly, settings)
     weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
-    of_masks = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group], table.mask_view
-    size = votes.vote.shape[0], groups.count
+    reporting = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group]
+    reporting[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
+    of_masks, size = (reporting, table.mask_view), (votes.vote.shape[0], groups.count)
     likely, reports = likely_states(
         of_points, of_masks, size, clear, support.group, openly, around, weights, scene.reports if scene else None
     )

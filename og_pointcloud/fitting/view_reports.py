@@ -13,9 +13,11 @@ view v, which reports r of point g, makes "g is in state k" likely by
 
     p_v(g) c_v(k, r) + (1 - p_v(g)) HIDDEN
 
-as what stands before a hidden point may be anything. The logarithms are added up over views, but count as ENOUGH
-independent views at most: views that look alike err alike. Points adjoin others, of which they are the likelier of one
-thing the more their colors say so (colors.py); each hears how likely its neighbors are in each state (mean field).
+as what stands before a hidden point may be anything. A mask that spans several things is a report of its own, of which
+no state expects anything: a view that gives it tells that the point is of one of the things that lie in it. The
+logarithms are added up over views, but count as ENOUGH independent views at most: views that look alike err alike.
+Points adjoin others, of which they are the likelier of one thing the more their colors say so (colors.py); each hears
+how likely its neighbors are in each state (mean field).
 What views report is counted on points whose state is clear without it, and anew on the states that this makes likely.
 """
 
@@ -60,28 +62,32 @@ _EXACT = float(1 << 24)
 
 @dataclass(frozen=True)
 class ViewReports:
-    """c_v(k, r) of a scene, whose states are its groups and, as the last, background. column: (views, states) int32,
-    the column of a report in view v, -1 where v has no mask of it; background's is "no mask", the last. seat: (views,
-    states) int32, the row of a state, -1 where v sees no point that may be in it. first: (views + 1,) int64, where each
-    view's table begins in ``chance``: (rows times columns of all,) float32."""
+    """c_v(k, r) of a scene, whose numbers are its groups, its masks that span several, which are reports but no states,
+    and, as the last, background. column: (views, numbers) int32, the column of a report in view v, -1 where v has no
+    mask of it; background's is "no mask", the last. seat: (views, numbers) int32, the row of a state, -1 where v sees
+    no point that may be in it. first: (views + 1,) int64, where each view's table begins in ``chance``: (rows times
+    columns of all,) float32. spanned: (spanning masks, groups) bool, whether clear points of a group lie in the mask.
+    """
 
     column: NDArray[np.int32]
     seat: NDArray[np.int32]
     first: NDArray[np.int64]
     chance: NDArray[np.float32]
+    spanned: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class LikelyStates:
-    """The states that each point may be in: state[start[g] : start[g + 1]], groups, and background as the number after
-    the last group; none where no view sees it. They are background, the groups in whose masks it lies, and those of
-    points that adjoin it. masked: (all,) bool, it lies in a mask of that group. likely: (all,) float64, of sum 1 a
-    point. background: its number."""
+    """The states that each point may be in: state[start[g] : start[g + 1]], groups, and background as the last number;
+    none where no view sees it. They are background, the groups in whose masks it lies, those that a mask in which it
+    lies spans, and those of points that adjoin it. masked: (all,) bool, not of the last alone. likely: (all,) float64,
+    of sum 1 a point. groups: how many. background: its number."""
 
     start: NDArray[np.int64]
     state: NDArray[np.int32]
     masked: NDArray[np.bool_]
     likely: NDArray[np.float64]
+    groups: int
     background: int
 
     @property
@@ -96,8 +102,8 @@ class LikelyStates:
     def expected_iou(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
         """(groups,) the IoU that each group's points in ``ids`` have with all that is of it, as far as states are as
         likely as found; 0 where nothing is."""
-        count, grouped = self.background, ids >= 0
-        of_group = np.bincount(self.state, self.likely, count + 1)[:count]
+        count, grouped = self.groups, ids >= 0
+        of_group = np.bincount(self.state, self.likely, self.background + 1)[:count]
         right = np.bincount(ids[grouped], self.of(ids)[grouped], count)
         either = np.bincount(ids[grouped], minlength=count) + of_group - right
         return np.divide(right, either, out=np.zeros(count), where=either > 0)
@@ -116,20 +122,22 @@ def likely_states(
 ) -> tuple[LikelyStates, ViewReports]:
     """How likely points are in each state, and what views report.
 
-    of_masks: the group of each mask, -1 none, which says nothing; and its view. size: views and groups. clear: (n,) the
-    states of points that are clear, UNOBSERVED of others. asked: (n,) the group that each point is asked of, -1 none:
+    of_masks: the group of each mask, -1 none, which says nothing, or, of one that spans several, a number of its own
+    after the groups; and its view. size: views and groups. clear: (n,) the states of points that are clear, UNOBSERVED
+    of others. asked: (n,) the group that each point is asked of, -1 none:
     points that adjoin it may be of that group too. openly: (n,) in [0, 1], what counts of votes on each point.
     weights: of neighbors, as of `neighbor_weights`. reports: of the scene that these points are a part of; None: they
     are all of it, and it is counted on them.
     """
-    found = _candidates(of_points, of_masks[0], size[1], clear, asked, around)
+    spanned = _spanned(of_points, of_masks[0], size[1], clear) if reports is None else reports.spanned
+    found = _candidates(of_points, of_masks[0], spanned, clear, asked, around)
 
     def settled_by(reports: ViewReports) -> LikelyStates:
         return _settled(_evidence(of_points, of_masks, found, openly, reports), found, around, weights, openly)
 
     if reports is not None:
         return settled_by(reports), reports
-    reports, states = _nothing_reported(of_points, of_masks, size, found), found
+    reports, states = _nothing_reported(of_points, of_masks, size[0], spanned, found), found
     for _ in range(COUNTED):
         reports = _learned(of_points, of_masks, states, openly, reports)
         states = settled_by(reports)
@@ -139,34 +147,62 @@ def likely_states(
 # States that points may be in ----------------------------------------------------------------------------------------
 
 
+def _spanned(
+    of_points: VotesOfPoints, group: NDArray[np.int32], groups: int, clear: NDArray[np.int32]
+) -> NDArray[np.bool_]:
+    """`ViewReports.spanned`."""
+    spanned, low = np.zeros((max(int(group.max(initial=-1)) + 1 - groups, 0), groups), np.bool_), 0
+    for some in of_points if len(spanned) else ():
+        low = _mark_spanned(*some()[0], low, group, clear, spanned)
+    return spanned
+
+
+@njit(cache=True)
+def _mark_spanned(mask_start, of_mask, low, group, clear, spanned):  # noqa: ANN001, ANN202
+    """Marks what masks span of the points from ``low`` on. Returns the point after the last."""
+    groups = spanned.shape[1]
+    for i in range(len(mask_start) - 1):
+        for e in range(mask_start[i], mask_start[i + 1]):
+            if group[of_mask[e].row] >= groups and clear[low + i] >= 0:
+                spanned[group[of_mask[e].row] - groups, clear[low + i]] = True
+    return low + len(mask_start) - 1
+
+
 def _candidates(
     of_points: VotesOfPoints,
     group: NDArray[np.int32],
-    groups: int,
+    spanned: NDArray[np.bool_],
     clear: NDArray[np.int32],
     asked: NDArray[np.int32],
     around: Neighborhood,
 ) -> LikelyStates:
     """Those of each point; a clear one is likely in its state alone, and others in none. group: (masks,)."""
-    low, found, clear = 0, [], np.where(clear == BACKGROUND, groups, clear)  # as candidates are numbered
+    (spanning, groups), low, found = spanned.shape, 0, []
+    background = groups + spanning
+    clear = np.where(clear == BACKGROUND, background, clear)  # as candidates are numbered
+    spans = np.concatenate([[0], np.cumsum(spanned.sum(axis=1))]), np.nonzero(spanned)[1].astype(np.int32)
+    near = asked, around.index, around.adjoining
     for some in of_points:
         masks, views = some()
-        found.append(_of_each_point(masks, views[0], low, group, groups, asked, around.index, around.adjoining))
+        found.append(_of_each_point(masks, views[0], low, group, groups, spans, near))
         low += len(masks[0]) - 1
     counts, state, masked = (np.concatenate(parts) for parts in zip(*found, strict=True))
     start, likely = np.concatenate([[0], np.cumsum(counts)]), (state == np.repeat(clear, counts)).astype(np.float64)
-    return LikelyStates(start, state, masked, likely, groups)
+    return LikelyStates(start, state, masked, likely, groups, background)
 
 
 @njit(cache=True)
-def _of_each_point(masks, view_start, low, group, groups, asked, neighbors, adjoining):  # noqa: ANN001, ANN202
+def _of_each_point(masks, view_start, low, group, groups, spans, near):  # noqa: ANN001, ANN202
     """(n,) how many candidates each of the points from ``low`` on has; and (all,) which, and which of them it lies in
-    a mask of."""
-    mask_start, of_mask = masks
-    n = len(mask_start) - 1
+    a mask of. spans: (start, groups) of spanning masks. near: as of `likely_states`, with neighbors."""
+    (mask_start, of_mask), (first, within), (asked, neighbors, adjoining) = masks, spans, near
+    n, most = len(mask_start) - 1, 0
+    for e in range(len(of_mask)):
+        k = group[of_mask[e].row] - groups
+        most += 1 if k < 0 else first[k + 1] - first[k]
     count = np.zeros(n, np.int64)
-    # A point has background, and at most one for each mask and each neighbor.
-    found = np.empty(n * (neighbors.shape[1] + 1) + len(of_mask), np.int32)
+    # A point has background, and at most one for each mask, or each that a mask spans, and each neighbor.
+    found = np.empty(n * (neighbors.shape[1] + 1) + most, np.int32)
     masked = np.empty(len(found), np.bool_)
     end = 0
     for i in range(n):
@@ -175,15 +211,19 @@ def _of_each_point(masks, view_start, low, group, groups, asked, neighbors, adjo
         begin, g = end, low + i
         for e in range(mask_start[i], mask_start[i + 1]):
             k = group[of_mask[e].row]
-            if k >= 0 and not _holds(found, begin, end, k):
+            if 0 <= k < groups and not _holds(found, begin, end, k):
                 found[end], masked[end] = k, True
                 end += 1
+            for s in range(first[k - groups], first[k - groups + 1]) if k >= groups else range(0):
+                if not _holds(found, begin, end, within[s]):
+                    found[end], masked[end] = within[s], True
+                    end += 1
         for j in range(neighbors.shape[1]):
             k = asked[neighbors[g, j]]
             if adjoining[g, j] and k >= 0 and not _holds(found, begin, end, k):
                 found[end], masked[end] = k, False
                 end += 1
-        found[end], masked[end] = groups, True
+        found[end], masked[end] = groups + len(first) - 1, True
         end += 1
         count[i] = end - begin
     return count, found[:end].copy(), masked[:end].copy()
@@ -203,21 +243,22 @@ def _holds(found, begin, end, k):  # noqa: ANN001, ANN202
 def _nothing_reported(
     of_points: VotesOfPoints,
     of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
-    size: tuple[int, int],
+    views: int,
+    spanned: NDArray[np.bool_],
     found: LikelyStates,
 ) -> ViewReports:
     """The tables of all views, empty."""
-    (group, mask_view), (views, groups) = of_masks, size
-    shown = np.zeros((views, groups + 1), np.bool_)
+    group, mask_view = of_masks
+    shown = np.zeros((views, found.background + 1), np.bool_)
     shown[mask_view[group >= 0], group[group >= 0]] = True
-    shown[:, groups] = True
+    shown[:, found.background] = True
     column = np.where(shown, np.cumsum(shown, axis=1) - 1, -1).astype(np.int32)
     seen, low = np.zeros(shown.shape, np.bool_), 0
     for some in of_points:
         low = _mark_seen(*some()[1], low, found.start, found.state, seen)
     seat = np.where(seen, np.cumsum(seen, axis=1) - 1, -1).astype(np.int32)
     first = np.concatenate([[0], np.cumsum(seen.sum(axis=1) * shown.sum(axis=1))]).astype(np.int64)
-    return ViewReports(column, seat, first, np.zeros(first[-1], np.float32))
+    return ViewReports(column, seat, first, np.zeros(first[-1], np.float32), spanned)
 
 
 @njit(cache=True)

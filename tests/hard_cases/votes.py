@@ -95,6 +95,13 @@ def borders_by_color(seed: float) -> Answer:
     return Answer(ours.instance_ids, ids)
 
 
+@agrees(1e-6, "seed", tuple(range(4)))
+def spanning_masks_of_any_votes(seed: float) -> Answer:
+    """How sure the same points are where two masks span several groups."""
+    ours, (_, certainty, _) = _both(int(seed), spanning=(10, 11))
+    return Answer(ours.certainty, certainty)
+
+
 @agrees(0)
 def seen_by_no_view() -> Answer:
     """Points that no view sees take the state of the nearest that one does; without one, they stay unobserved."""
@@ -178,28 +185,33 @@ def _lone(count: int) -> list[list[int]]:
 
 
 def _assigned(
-    table: MaskTable, group: list[int], neighbors: list[list[int]], rgb: NDArray[np.uint8] | None = None
-) -> Membership:
+    table: MaskTable, group: list[int], neighbors: list[list[int]], rgb: NDArray[np.uint8] | None = None,
+    spanning: tuple[int, ...] = (),
+) -> Membership:  # fmt: skip
     """The library's answer; neighbors of each point, nearest first."""
     width = max(1, *map(len, neighbors))
     index, adjoining = np.zeros((len(neighbors), width), np.int32), np.zeros((len(neighbors), width), bool)
     for point, near in enumerate(neighbors):
         index[point, : len(near)], adjoining[point, : len(near)] = near, True
     around = Neighborhood(np.ones(len(neighbors), np.float32), index, adjoining)
-    groups = MaskGroups(int32(group), max(group) + 1, np.zeros(len(group), bool))
+    groups = MaskGroups(int32(group), max(group) + 1, np.isin(np.arange(len(group)), spanning))
     return assign_points(table, view_votes(table), groups, around, MembershipSettings(), rgb)
 
 
-def _both(seed: int, rgb: NDArray[np.uint8] | None = None) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
+def _both(
+    seed: int, rgb: NDArray[np.uint8] | None = None, spanning: tuple[int, ...] = ()
+) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
     """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask; the
-    last mask is of none."""
+    last mask is of none, or spans several, as all of ``spanning`` do."""
     table = _table(seed)
     group = [mask % 3 for mask in range(12)]
-    group[3 + seed % 3], group[-1] = 3, -1
+    group[3 + seed % 3] = 3
+    for mask in {*spanning, len(group) - 1}:
+        group[mask] = -1
     near = [
         sorted((o for o in range(max(0, g - REACH), min(POINTS, g + REACH + 1)) if o != g), key=lambda o: abs(o - g))
         for g in range(POINTS)
     ]
     weights, settings = table.weights.toarray().astype(float), MembershipSettings()
-    exact = literal.membership(_literal(table), weights, table.mask_view.tolist(), group, near, settings, rgb)
-    return _assigned(table, group, near, rgb), exact
+    exact = literal.membership(_literal(table), weights, table.mask_view.tolist(), group, near, settings, rgb, spanning)
+    return _assigned(table, group, near, rgb, spanning), exact
