@@ -50,7 +50,10 @@ class LeftOut(Enum):
         "points finer than pixels", "{share:.0%} of the points in the images",
         "closer together than {finest_px:g} px, or more than {most:,} in one: larger ones stand in",
     )
-    SPANNING_MASKS = "spanning masks", "{count} masks", "most views show each of them as several things"
+    SPANNING_MASKS = (
+        "spanning masks", "{count} masks",
+        "most views show each of them as several things; all that they tell is that a point is of one of these",
+    )  # fmt: skip
     CONTRADICTED_GROUPS = (
         "contradicted groups", "{count} of {total} groups of masks",
         "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
