@@ -99,6 +99,7 @@ def assign_points(
     openly = _openly(votes.openness, settings.open_share * typical)
     clear = _clear(support, openly, settings)
     weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
+    # What each mask reports: its group, nothing, or that it spans several, under a number of its own after the groups.
     reporting = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group]
     reporting[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
     of_masks, size = (reporting, table.mask_view), (votes.vote.shape[0], groups.count)

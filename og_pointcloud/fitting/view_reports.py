@@ -17,8 +17,8 @@ as what stands before a hidden point may be anything. A mask that spans several 
 no state expects anything: a view that gives it tells that the point is of one of the things that lie in it. The
 logarithms are added up over views, but count as ENOUGH independent views at most: views that look alike err alike.
 Points adjoin others, of which they are the likelier of one thing the more their colors say so (colors.py); each hears
-how likely its neighbors are in each state (mean field).
-What views report is counted on points whose state is clear without it, and anew on the states that this makes likely.
+how likely its neighbors are in each state (mean field). What views report is counted on points whose state is clear
+without it, and anew on the states that this makes likely.
 """
 
 from __future__ import annotations
@@ -124,10 +124,9 @@ def likely_states(
 
     of_masks: the group of each mask, -1 none, which says nothing, or, of one that spans several, a number of its own
     after the groups; and its view. size: views and groups. clear: (n,) the states of points that are clear, UNOBSERVED
-    of others. asked: (n,) the group that each point is asked of, -1 none:
-    points that adjoin it may be of that group too. openly: (n,) in [0, 1], what counts of votes on each point.
-    weights: of neighbors, as of `neighbor_weights`. reports: of the scene that these points are a part of; None: they
-    are all of it, and it is counted on them.
+    of others. asked: (n,) the group that each point is asked of, -1 none: points that adjoin it may be of that group
+    too. openly: (n,) in [0, 1], what counts of votes on each point. weights: of neighbors, as of `neighbor_weights`.
+    reports: of the scene that these points are a part of; None: they are all of it, and it is counted on them.
     """
     spanned = _spanned(of_points, of_masks[0], size[1], clear) if reports is None else reports.spanned
     found = _candidates(of_points, of_masks[0], spanned, clear, asked, around)
