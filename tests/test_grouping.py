@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.grouping import group_masks, indicator, mask_shares
-from og_pointcloud.fitting.joining import FeatureOdds, Witnesses, feature_odds
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.settings import GroupingSettings
@@ -160,70 +159,6 @@ def test_a_cup_that_most_views_miss_is_not_welded_to_the_table() -> None:
 def test_a_part_with_the_feature_of_the_whole_is_joined() -> None:
     table, part = cup_on_table(ONE)
     assert table == part
-
-
-def named(rate: float, piece: NDArray[np.float32], missed: int) -> NDArray[np.int32]:
-    """Six things and, in three views, a piece of the first with this feature beside it, which the next ``missed`` views
-    show in its mask; a part ``rate`` of all masks is named as another thing. The groups of the first and the piece."""
-    random = np.random.default_rng(5)
-
-    def thing(k: int) -> tuple[range, NDArray[np.float32]]:
-        is_named = k if random.uniform() > rate else int(random.integers(6))
-        return range(30 * k, 30 * k + 30), np.eye(8, dtype=np.float32)[is_named]
-
-    views = [[thing(k) for k in range(6)] for _ in range(3 + missed)]
-    for view in views[:3]:
-        view[0] = range(20), ONE
-        view.append((range(20, 30), piece))
-    group = groups_of(hand_table(180, views))
-    return group[[0, 6]]
-
-
-def test_unlike_masks_are_two_things_as_far_as_masks_of_one_thing_are_alike() -> None:
-    """Of nine views six show the piece within the thing. Where names are sure, it is another thing that they missed;
-    where every second mask is named wrong, a wrong name tells nothing."""
-    sure, unsure = named(0.0, OTHER, 6), named(0.5, OTHER, 6)
-    assert sure[0] != sure[1]
-    assert unsure[0] == unsure[1]
-    alike = named(0.0, ONE, 6)
-    assert alike[0] == alike[1]
-
-
-FOUR_THINGS = np.tile(np.arange(4), 10), np.repeat(np.arange(10, dtype=np.int32), 4)
-"""The thing and the view of each of 40 masks, of which seven views of ten show this or that within another."""
-
-
-def odds_of(within: Sequence[tuple[int, int]], features: NDArray[np.float64]) -> FeatureOdds:
-    """Where masks of one thing have one extent, and these pairs are within one another."""
-    thing, view = FOUR_THINGS
-    extent = [(i, j) for i in range(40) for j in range(40) if view[i] != view[j] and thing[i] == thing[j]]
-    rows, cols = np.array([*extent, *within], np.int32).T
-    is_extent = np.arange(len(rows)) < len(extent)
-    one = np.full(len(rows), 7.0)
-    witnesses = Witnesses(
-        rows, cols, one, np.where(is_extent, one, 0), np.ones((len(view), 10)), np.ones((len(view), 10))
-    )
-    return feature_odds(witnesses, np.arange(len(rows)), features, view, 0.5)
-
-
-def test_views_that_mostly_show_unlike_masks_in_one_are_believed_less() -> None:
-    thing, view = FOUR_THINGS
-    features = np.eye(8)[thing]
-    features[[0, 5, 10, 15]] = np.eye(8)[5]  # named wrong
-    pairs = [(i, j) for i in range(40) for j in range(40) if view[i] != view[j]]
-    one, two = ([pair for pair in pairs if (thing[pair[0]] == thing[pair[1]]) == same] for same in (True, False))
-    assert odds_of(one, features).trust == odds_of([], features).trust == 1
-    assert odds_of(two, features).trust < 0.05 < odds_of([*one[:50], *two[:50]], features).trust < 0.9
-
-
-def test_masks_without_a_feature_do_not_tell_how_masks_are_named() -> None:
-    thing, view = FOUR_THINGS
-    features, described = np.eye(8)[thing], view < 5
-    features[~described] = 0
-    some = odds_of([(0, 9), (1, 38)], features)
-    assert len(some.same) == np.count_nonzero(described) * 4  # each with those of the other four views
-    assert len(some.different) == np.count_nonzero(described) * 3 / 2
-    assert some.trust == odds_of([(0, 9)], features).trust
 
 
 def test_many_noisy_features_are_no_more_alike_than_pairs_of_them() -> None:

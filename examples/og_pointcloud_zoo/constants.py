@@ -40,7 +40,6 @@ SCENES = (
 SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "fitting.joining.MOST_ODDS": ("", ()),
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.view_reports.HIDDEN": ("", ("_add_evidence",)),
     "fitting.view_reports.LEAST": ("", ("_at_least", "_share", "_add_evidence")),

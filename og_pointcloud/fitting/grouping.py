@@ -23,15 +23,17 @@ ours.
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.joining import Witnesses, join_masks
+from og_pointcloud.fitting.feature_odds import MOST_ODDS, FeatureOdds, feature_odds, odds
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
 
 
@@ -56,7 +58,7 @@ def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np
     witnesses = _witnesses(share, container, left_out, table, settings)
     shown = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     usable = ~spanning & (shown > 0)
-    group = join_masks(witnesses, table.unit_features, table.mask_view, usable, settings.join_majority)
+    group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
     return MaskGroups(*_ordered(group, shown), spanning)
 
 
@@ -142,13 +144,32 @@ def _containers(
     return csr_array((np.ones(len(rows), np.float32), (rows, cols)), shape=share.shape)
 
 
+@dataclass(frozen=True)
+class _Witnesses:
+    """What views, and the tracker, say of pairs of masks.
+
+    rows, cols: the pairs that any of them shows as one thing, both ways, rows ascending. one: how many say so.
+    same_extent: how many of these count whatever the features say: all if the two masks have the same extent, else the
+    tracker alone. speaks, hears: (masks, ...); speaks[i] @ hears[j] is how many witnesses say anything of a pair: views
+    in which both have a container, or one does and the other is left out; and the tracker where both tracks are the
+    same or were in one image.
+    """
+
+    rows: NDArray[np.int32]
+    cols: NDArray[np.int32]
+    one: NDArray[np.float64]
+    same_extent: NDArray[np.float64]
+    speaks: NDArray[np.float64]
+    hears: NDArray[np.float64]
+
+
 def _witnesses(
     share: csr_array,
     container: csr_array,
     left_out: NDArray[np.bool_],
     table: MaskTable,
     settings: GroupingSettings,
-) -> Witnesses:
+) -> _Witnesses:
     views = left_out.shape[1]
     held = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
     # (h + l)(h' + l') - l l' is hh' + hl' + lh': views that hold both, or hold one and leave out the other.
@@ -170,7 +191,135 @@ def _witnesses(
     # Of the same extent: either lies mostly in the other.
     smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
     sure = np.where(smaller > settings.container_share, one, _lookup(followed, rows, cols))
-    return Witnesses(rows, cols, one, sure, speaks, hears)
+    return _Witnesses(rows, cols, one, sure, speaks, hears)
+
+
+def _agglomerate(
+    witnesses: _Witnesses,
+    features: NDArray[np.float32],
+    mask_view: NDArray[np.int32],
+    usable: NDArray[np.bool_],
+    settings: GroupingSettings,
+) -> NDArray[np.int64]:
+    """Join the pair of groups with the most agreement until no majority is left; a group number per mask, -1 unused.
+
+    The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
+    are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
+    a table whose view missed the cup: then these witnesses are believed as far as features let them (feature_odds.py).
+    Of pairs with the same agreement the one with more witnesses comes first, then the one with more similar features:
+    the order of views and masks does not matter.
+    """
+    # A group's number is that of its lowest mask. Of features the sum and the number are kept, for means over pairs.
+    w, everyone = witnesses, np.arange(len(usable) + 1)
+    kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
+    links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
+    group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
+    said = w.speaks.copy(), w.hears.copy(), total, features.any(axis=1).astype(np.float64)
+    scene = _odds_of_features(w, kept, features, mask_view, settings)
+    _join(group, links, said, (scene.same, scene.different, scene.trust), settings.join_majority)
+    return _roots(group)
+
+
+def _odds_of_features(
+    w: _Witnesses,
+    kept: NDArray[np.intp],
+    features: NDArray[np.float32],
+    mask_view: NDArray[np.int32],
+    settings: GroupingSettings,
+) -> FeatureOdds:
+    """What features say in this scene. kept: the pairs of witnesses whose masks take part."""
+    rows, cols, one = w.rows[kept], w.cols[kept], w.one[kept]
+    share = one / np.einsum("ij,ij->i", w.speaks[rows], w.hears[cols])
+    same = w.same_extent[kept] > 0
+    within = ~same & (share > settings.join_majority) & (mask_view[rows] != mask_view[cols])
+    return feature_odds(features, mask_view, (rows[same], cols[same]), (rows[within], cols[within]), share[within])
+
+
+@njit(cache=True)
+def _join(group, links, said, believed, majority):  # noqa: ANN001, ANN202
+    """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
+
+    links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, how many) of
+    each mask; here they become the sums of groups. believed: of `FeatureOdds`.
+    """
+    start, others, one, same_extent = links
+    speaks, hears, features, described = said
+    rows = [slice(start[a], start[a + 1]) for a in range(len(group))]
+    linked = [(others[row], one[row], same_extent[row]) for row in rows]
+    version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
+    # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then. (An
+    # empty list of a known type, which numba needs.)
+    heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
+    for a in range(len(group)):
+        _offer(heap, a, a, linked[a], said, version, believed, majority)
+    while len(heap):
+        _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
+        # Stale: one of the two has grown or joined another since it was offered; what it is now was offered anew.
+        if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
+            continue
+        # The higher number joins the lower one, which takes on all that either says.
+        group[b] = a
+        version[a] += 1
+        speaks[a] += speaks[b]
+        hears[a] += hears[b]
+        features[a] += features[b]
+        described[a] += described[b]
+        linked[a] = _pooled(linked[a], linked[b], a, group, place)
+        linked[b] = others[:0], one[:0], same_extent[:0]
+        _offer(heap, a, -1, linked[a], said, version, believed, majority)
+
+
+@njit(cache=True)
+def _offer(heap, a, above, links, said, version, believed, majority):  # noqa: ANN001, ANN202
+    """Puts on the heap the pairs of group a and those linked to it, of numbers above one, that most witnesses join."""
+    speaks, hears, features, described = said
+    for b, one, same_extent in zip(*links):  # noqa: B905
+        asked = np.dot(speaks[b], hears[a])
+        if b <= above or one / asked <= majority:  # features only ever take agreement away
+            continue
+        # The mean over pairs of masks, as the scene's cosines are of pairs: sums have less noise, and are more alike.
+        pairs = described[a] * described[b]
+        cosine = np.dot(features[a], features[b]) / pairs if pairs > 0 else 0.0
+        same, different, trust = believed
+        alike = odds(cosine, same, different, trust) if pairs > 0 else trust
+        free = one - same_extent
+        against = max(asked - one, free * (1 - alike) / MOST_ODDS)
+        agreement = (same_extent + free * alike) / (same_extent + free * alike + against)
+        if agreement > majority:
+            low, high = min(a, b), max(a, b)
+            heapq.heappush(heap, (-agreement, -asked, -cosine, low, high, version[low], version[high]))
+
+
+@njit(cache=True)
+def _pooled(first, second, a, group, place):  # noqa: ANN001, ANN202
+    """The links of group a, of those that both parts of it had before, each other group once.
+
+    place: (masks,) all -1, and so again in the end.
+    """
+    most = len(first[0]) + len(second[0])
+    others, one, same_extent = np.empty(most, np.int64), np.zeros(most), np.zeros(most)
+    count = 0
+    for links in (first, second):
+        for b, of_one, of_same_extent in zip(*links):  # noqa: B905
+            while group[b] != b:  # which joined another since
+                b = group[b]
+            if b == a:
+                continue
+            if place[b] < 0:
+                place[b], others[count], count = count, b, count + 1
+            one[place[b]] += of_one
+            same_extent[place[b]] += of_same_extent
+    place[others[:count]] = -1
+    return others[:count], one[:count], same_extent[:count]
+
+
+def _roots(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Follow each mask to the group it ended in."""
+    while True:
+        parent = np.where(group >= 0, group[group], -1)
+        if (parent == group).all():
+            return group
+        group = parent
 
 
 def _ordered(group: NDArray[np.int64], shown: NDArray[np.floating]) -> tuple[NDArray[np.int32], int]:
