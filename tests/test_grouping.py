@@ -387,48 +387,23 @@ def reference_joins(
     usable: NDArray[np.bool_],
 ) -> list[list[int]]:
     pairs = list(combinations(range(len(view)), 2))
-    both_ways = [(i, j) for i in range(len(view)) for j in range(len(view)) if i != j and usable[i] and usable[j]]
     different = np.array([features[i] @ features[j] for i, j in pairs if view[i] == view[j]])
 
-    def said(i: int, j: int) -> tuple[float, float, float]:
-        """How many views say that two masks are one thing; how many of them since their extent is the same; asked."""
-        both = (container[i] >= 0) & (container[j] >= 0)
-        one = float((both & (container[i] == container[j])).sum())
-        same = one if min(share[i, j], share[j, i]) > SETTINGS.container_share else 0.0
-        one_alone = ((container[i] >= 0) & left_out[j]) | ((container[j] >= 0) & left_out[i])
-        return one, same, both.sum() + 0.5 * one_alone.sum()
-
-    alike = np.array([features[i] @ features[j] for i, j in both_ways if said(i, j)[1] > 0])
-    within = [
-        (i, j)
-        for i, j in both_ways
-        if view[i] != view[j] and said(i, j)[1] == 0 and said(i, j)[0] > SETTINGS.join_majority * said(i, j)[2]
-    ]
-
-    def ratio(cosine: float) -> float:
-        shares = []
-        for cosines in (alike, different):
-            below = 0.5 * ((cosines < cosine - 1e-6).sum() + (cosines <= cosine + 1e-6).sum())
-            shares.append((below + 0.5) / (len(cosines) + 1))
-        return shares[0] * (1 - shares[0]) / (shares[1] * (1 - shares[1]))
-
-    trust = 1.0
-    if within:
-        ratios, one = [ratio(float(features[i] @ features[j])) for i, j in within], 0.5
-        for _ in range(50):
-            one = (sum(one * r / (one * r + 1 - one) for r in ratios) + 1) / (len(ratios) + 2)
-        view_share = float(np.mean([min(said(i, j)[0] / said(i, j)[2], 0.8) for i, j in within]))
-        trust = min(1.0, one / (1 - one) * (1 - view_share) / view_share)
-
     def agreement(a: list[int], b: list[int]) -> tuple[float, float, float]:
-        one, same, asked = np.sum([said(i, j) for i in a for j in b], axis=0)
+        one = same = asked = 0.0
+        for i in a:
+            for j in b:
+                both = (container[i] >= 0) & (container[j] >= 0)
+                together = float((both & (container[i] == container[j])).sum())
+                one += together
+                same += together if min(share[i, j], share[j, i]) > SETTINGS.container_share else 0.0
+                one_alone = ((container[i] >= 0) & left_out[j]) | ((container[j] >= 0) & left_out[i])
+                asked += both.sum() + 0.5 * one_alone.sum()
         if asked == 0:
             return 0.0, 0.0, 0.0
-        cosine = float(np.mean([features[i] @ features[j] for i in a for j in b]))
-        believed = min(1.0, trust * ratio(cosine))
-        free = one - same
-        against = max(asked - one, free * (1 - believed) / 4)
-        return (same + free * believed) / (same + free * believed + against), asked, cosine
+        cosine = np.mean([features[i] @ features[j] for i in a for j in b])
+        below = 0.5 * ((different < cosine - 1e-6).mean() + (different <= cosine + 1e-6).mean())
+        return (same + (one - same) * below) / asked, asked, cosine
 
     groups = [[int(i)] for i in np.flatnonzero(usable)]
     while len(groups) > 1:

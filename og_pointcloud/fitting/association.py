@@ -26,7 +26,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.feature_odds import cosines_of_different
+from og_pointcloud.fitting.grouping import cosines_of_different
 from og_pointcloud.fitting.mask_table import MaskTable
 
 MOSTLY = 0.5

@@ -30,11 +30,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.feature_odds import MOST_ODDS, FeatureOdds, feature_odds, odds
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
+
+UNKNOWN_LIKENESS = 0.5
+"""Likeness where features say nothing: the middle rank (`_likeness`)."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def _agglomerate(
 
     The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
     are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
-    a table whose view missed the cup: then these witnesses are believed as far as features let them (feature_odds.py).
+    a table whose view missed the cup: then the witnesses count as far as the features are alike.
     Of pairs with the same agreement the one with more witnesses comes first, then the one with more similar features:
     the order of views and masks does not matter.
     """
@@ -215,32 +217,26 @@ def _agglomerate(
     links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
     group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
     said = w.speaks.copy(), w.hears.copy(), total, features.any(axis=1).astype(np.float64)
-    scene = _odds_of_features(w, kept, features, mask_view, settings)
-    _join(group, links, said, (scene.same, scene.different, scene.trust), settings.join_majority)
+    _join(group, links, said, cosines_of_different(features, mask_view), settings.join_majority)
     return _roots(group)
 
 
-def _odds_of_features(
-    w: _Witnesses,
-    kept: NDArray[np.intp],
-    features: NDArray[np.float32],
-    mask_view: NDArray[np.int32],
-    settings: GroupingSettings,
-) -> FeatureOdds:
-    """What features say in this scene. kept: the pairs of witnesses whose masks take part."""
-    rows, cols, one = w.rows[kept], w.cols[kept], w.one[kept]
-    share = one / np.einsum("ij,ij->i", w.speaks[rows], w.hears[cols])
-    same = w.same_extent[kept] > 0
-    within = ~same & (share > settings.join_majority) & (mask_view[rows] != mask_view[cols])
-    return feature_odds(features, mask_view, (rows[same], cols[same]), (rows[within], cols[within]), share[within])
+def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Cosines of the features of two masks of one view, ascending. These are mostly different things, whatever the
+    encoder: they calibrate its cosines."""
+    cosines = [np.zeros(0)]
+    for view in np.unique(mask_view):
+        rows = features[mask_view == view][:200]  # 20,000 pairs of a view are enough
+        cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
+    return np.sort(np.concatenate(cosines))
 
 
 @njit(cache=True)
-def _join(group, links, said, believed, majority):  # noqa: ANN001, ANN202
+def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
     """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
 
     links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, how many) of
-    each mask; here they become the sums of groups. believed: of `FeatureOdds`.
+    each mask; here they become the sums of groups. different: as of `cosines_of_different`.
     """
     start, others, one, same_extent = links
     speaks, hears, features, described = said
@@ -251,7 +247,7 @@ def _join(group, links, said, believed, majority):  # noqa: ANN001, ANN202
     # empty list of a known type, which numba needs.)
     heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
     for a in range(len(group)):
-        _offer(heap, a, a, linked[a], said, version, believed, majority)
+        _offer(heap, a, a, linked[a], said, version, different, majority)
     while len(heap):
         _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
         # Stale: one of the two has grown or joined another since it was offered; what it is now was offered anew.
@@ -266,28 +262,35 @@ def _join(group, links, said, believed, majority):  # noqa: ANN001, ANN202
         described[a] += described[b]
         linked[a] = _pooled(linked[a], linked[b], a, group, place)
         linked[b] = others[:0], one[:0], same_extent[:0]
-        _offer(heap, a, -1, linked[a], said, version, believed, majority)
+        _offer(heap, a, -1, linked[a], said, version, different, majority)
 
 
 @njit(cache=True)
-def _offer(heap, a, above, links, said, version, believed, majority):  # noqa: ANN001, ANN202
+def _offer(heap, a, above, links, said, version, different, majority):  # noqa: ANN001, ANN202
     """Puts on the heap the pairs of group a and those linked to it, of numbers above one, that most witnesses join."""
     speaks, hears, features, described = said
     for b, one, same_extent in zip(*links):  # noqa: B905
         asked = np.dot(speaks[b], hears[a])
         if b <= above or one / asked <= majority:  # features only ever take agreement away
             continue
-        # The mean over pairs of masks, as the scene's cosines are of pairs: sums have less noise, and are more alike.
+        # The mean over pairs of masks, as ``different`` is of pairs: sums have less noise, and any two are more alike.
         pairs = described[a] * described[b]
         cosine = np.dot(features[a], features[b]) / pairs if pairs > 0 else 0.0
-        same, different, trust = believed
-        alike = odds(cosine, same, different, trust) if pairs > 0 else trust
-        free = one - same_extent
-        against = max(asked - one, free * (1 - alike) / MOST_ODDS)
-        agreement = (same_extent + free * alike) / (same_extent + free * alike + against)
+        alike = _likeness(cosine, different) if pairs > 0 else UNKNOWN_LIKENESS
+        agreement = (same_extent + (one - same_extent) * alike) / asked
         if agreement > majority:
             low, high = min(a, b), max(a, b)
             heapq.heappush(heap, (-agreement, -asked, -cosine, low, high, version[low], version[high]))
+
+
+@njit(cache=True)
+def _likeness(cosine, different):  # noqa: ANN001, ANN202
+    """The share of different things that are less alike."""
+    if not len(different):
+        return UNKNOWN_LIKENESS
+    # The mean of the ranks with and without equal ones; cosines within rounding are equal.
+    below = np.searchsorted(different, cosine - 1e-6, "left") + np.searchsorted(different, cosine + 1e-6, "right")
+    return 0.5 * below / len(different)
 
 
 @njit(cache=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.association import directions, members_of, shown_of_instance
-from og_pointcloud.fitting.feature_odds import cosines_of_different
+from og_pointcloud.fitting.grouping import cosines_of_different
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 
