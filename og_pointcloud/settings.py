@@ -98,6 +98,8 @@ class GroupingSettings(_Checked):
     """A mask lies in another view's mask when more than this share of it does: at most one can hold it."""
     join_majority: float = 0.5
     """Groups are joined while more than this share of their witnesses says "one thing"."""
+    spanning_share: float = 0.15
+    """A mask that holds most of two groups spans them where either is more than this share of it."""
     left_out_voice: float = 0.5
     """Voice of a view that sees two masks and has a mask of one of them alone, where one that shows both has one."""
 

@@ -199,6 +199,18 @@ MUTATIONS = (
         ("test_grouping.py",),
     ),
     Mutation(
+        "a mask that swallowed a thing tells that it is of its own", "fitting/grouping.py",
+        "np.where(self.spanning, -1, self.group)", "self.group", ("test_grouping.py", "test_view_reports.py"),
+    ),
+    Mutation(
+        "points are not asked which masks span things", "fitting/membership.py",
+        "if (known.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
+    ),
+    Mutation(
+        "crumbs make masks span", "fitting/grouping.py",
+        "held > settings.spanning_share * whole", "held > 0", ("test_grouping.py",),
+    ),
+    Mutation(
         "masks that span objects take part", "fitting/grouping.py",
         "usable = ~spanning & (shown > 0)", "usable = shown > 0", ("test_grouping.py",),
     ),

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.grouping import group_masks, indicator, mask_shares
+from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator, mask_shares, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.settings import GroupingSettings
@@ -322,6 +322,52 @@ def test_what_shows_through_holes_says_which_masks_hold_the_same() -> None:
     np.testing.assert_array_equal(groups_of(table), [0, 1, 0, 1])
     # Without it, what is left of the vase in that view is mostly the plant's.
     assert not np.array_equal(groups_of(replace(holed, doubted=None)), groups_of(table))
+
+
+CUP, TABLE = range(80, 100), range(80)
+APART: HandView = [(TABLE, ONE), (CUP, OTHER)]
+
+
+@pytest.mark.parametrize(("held", "spans"), [(range(65, 100), True), (range(75, 100), False), (range(92), True)])
+def test_a_mask_that_holds_most_of_two_groups_spans_them(held: range, spans: bool) -> None:
+    """The last view sees 20 points of the table."""
+    table = hand_table(100, [APART, APART, [(held, ONE)]], [[], [], range(60)])
+    ids = np.repeat([0, 1], [80, 20]).astype(np.int32)
+    groups = MaskGroups(np.array([0, 1, 0, 1, 0], np.int32), 2, np.zeros(5, bool))
+    found = with_spanning(groups, view_votes(table), table.mask_view, ids, SETTINGS)
+    assert found.spanning.tolist() == [False] * 4 + [spans]
+    assert found.group.tolist() == groups.group.tolist()  # it keeps its name
+    assert found.told.tolist() == [0, 1, 0, 1, -1 if spans else 0]
+
+
+def test_a_crumb_of_another_group_makes_no_mask_span() -> None:
+    """All of it is in the mask, but it is little of the mask."""
+    crumb = [(range(90), ONE), (range(90, 100), OTHER)]
+    table = hand_table(100, [crumb, crumb, [(range(100), ONE)]])
+    groups = MaskGroups(np.array([0, 1, 0, 1, 0], np.int32), 2, np.zeros(5, bool))
+    votes, ids = view_votes(table), np.repeat([0, 1], [90, 10]).astype(np.int32)
+    for share, spans in ((SETTINGS.spanning_share, False), (0.05, True)):
+        found = with_spanning(groups, votes, table.mask_view, ids, replace(SETTINGS, spanning_share=share))
+        assert found.spanning.tolist() == [False] * 4 + [spans]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_masks_that_span_groups_are_those_of_the_literal_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    votes, masks, n = view_votes(table), *table.weights.shape
+    groups = MaskGroups(rng.integers(-1, 3, masks).astype(np.int32), 3, rng.random(masks) < 0.2)
+    ids = np.sort(rng.integers(-2, 3, n)).astype(np.int32)
+    in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
+    expected = groups.spanning.copy()
+    for m in range(masks):
+        spanned = 0
+        for k in range(3):
+            held, shown = in_mask[m, ids == k].sum(), vote[table.mask_view[m], ids == k].sum()
+            spanned += held > SETTINGS.container_share * shown and held > SETTINGS.spanning_share * in_mask[m].sum()
+        expected[m] |= spanned > 1 and groups.group[m] >= 0
+    found = with_spanning(groups, votes, table.mask_view, ids, SETTINGS)
+    np.testing.assert_array_equal(found.spanning, expected)
 
 
 # The literal reference: the module's formulas with dense arrays and loops over pairs.

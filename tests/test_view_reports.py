@@ -17,11 +17,11 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting import view_votes as votes_module
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import Membership, assign_points
+from og_pointcloud.fitting.membership import Membership, assign_points, settled_points
 from og_pointcloud.fitting.view_reports import EXPECTED, LEAST
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import neighborhood
-from og_pointcloud.settings import GeometrySettings, MembershipSettings
+from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings
 
 N = 60
 BOOK, SHELF = range(20, 40), [*range(20), *range(40, 60)]
@@ -48,6 +48,27 @@ def test_a_view_that_calls_the_whole_book_shelf_does_not_count_against_the_book(
     found = decide(table, [0, 1] * 7)
     assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
     assert (found.certainty[24:36] > 0.99).all()
+
+
+def test_masks_that_swallow_a_thing_tell_of_neither_once_points_have_chosen() -> None:
+    """Two views know shelf and book, three show both in one mask: of two groups, whose names they keep."""
+    both: HandView = [(range(N), ONE)]
+    table = hand_table(N, [KNOWS] * 2 + [both] * 3)
+    before = MaskGroups(np.array([0, 1, 0, 1, 0, 0, 1], np.int32), 2, np.zeros(7, bool))
+    around, settings = neighborhood(on_a_line(N), GeometrySettings()), FitSettings()
+    known, found = settled_points(table, view_votes(table), before, around, settings)
+    assert known.spanning.tolist() == [False] * 4 + [True] * 3
+    assert known.group.tolist() == before.group.tolist()
+    assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
+    assert found.scene.reports.spanned.tolist() == [[True, True]] * 3
+
+
+def test_where_no_mask_spans_two_things_points_choose_once() -> None:
+    table = hand_table(N, [KNOWS] * 3)
+    before, around = groups([0, 1] * 3), neighborhood(on_a_line(N), GeometrySettings())
+    known, found = settled_points(table, view_votes(table), before, around, FitSettings())
+    assert known is before
+    assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
 
 
 def test_what_views_report_is_counted_on_clear_points() -> None:

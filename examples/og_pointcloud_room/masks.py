@@ -24,7 +24,8 @@ class MaskNoise:
     split: chance that a visible object comes as two or three masks. merge: chance that it is joined with an object it
     touches in the image. miss: chance that it has no mask. spurious: chance that a view has a mask on bare wall or
     floor. wrong_class: chance that a mask's feature is that of another class. edge_px: how far edges wander, pixels.
-    smallest_share: masks below this share of the image are dropped.
+    smallest_share: masks below this share of the image are dropped. swallow: chance that what has no mask lies in that
+    of something larger, the one it touches most, as a cup in its table's; else that mask has a hole there.
     """
 
     split: float = 0.15
@@ -34,6 +35,7 @@ class MaskNoise:
     wrong_class: float = 0.05
     edge_px: float = 0.7
     smallest_share: float = 2e-4
+    swallow: float = 0.0
 
     def scaled(self, level: float) -> MaskNoise:
         """The same proposer with every chance and the edges' wandering times ``level`` (0: perfect masks)."""
@@ -52,7 +54,7 @@ def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> ND
     # A proposer's errors one after another: joined, missing, split and spurious masks.
     regions = [owner == instance for instance in np.unique(owner[owner >= 0])]
     regions = _merged(regions, noise.merge, rng)
-    regions = [region for region in regions if rng.uniform() >= noise.miss]
+    regions = _found(regions, noise, rng)
     regions = [
         part for region in regions for part in (_split(region, rng) if rng.uniform() < noise.split else [region])
     ]
@@ -77,6 +79,20 @@ def _merged(regions: list[NDArray[np.bool_]], chance: float, rng: Random) -> lis
             other = touching[rng.integers(len(touching))]
             merged[other], merged[index] = merged[other] | merged[index], np.zeros_like(merged[index])
     return [region for region in merged if region.any()]
+
+
+def _found(regions: list[NDArray[np.bool_]], noise: MaskNoise, rng: Random) -> list[NDArray[np.bool_]]:
+    """The regions that are not missed, some of them with what was missed within them."""
+    found = [rng.uniform() >= noise.miss for _ in regions]
+    kept = {index: regions[index] for index in np.flatnonzero(found).tolist()}
+    for index in np.flatnonzero(~np.array(found, bool)).tolist() if noise.swallow else []:
+        rim = cv2.dilate(regions[index].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        larger = [other for other, region in kept.items() if region.sum() > regions[index].sum()]
+        touching = {other: int((regions[other] & rim).sum()) for other in larger}
+        most = max(touching, key=lambda other: touching[other], default=None)
+        if rng.uniform() < noise.swallow and most is not None and touching[most] > 10:
+            kept[most] = kept[most] | regions[index]
+    return list(kept.values())
 
 
 def _split(region: NDArray[np.bool_], rng: Random) -> list[NDArray[np.bool_]]:

@@ -33,6 +33,7 @@ class Draw:
     each view comes three times, with masks of parts, of things, and of things with what stands on them. confused: mean
     share of a thing's masks that are named as something alike (`places.ALIKE`); of each thing from none to twice that.
     blurred: share of views whose masks are ragged and often missing, as of a camera that moves.
+    swallow: chance that what has no mask lies in that of what it stands on or before.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Draw:
     levels: bool = False
     confused: float = 0.0
     blurred: float = 0.0
+    swallow: float = 0.0
 
 
 Fixed = Mapping[str, Any]
@@ -85,6 +87,8 @@ KINDS: Mapping[str, Fixed] = {
         "split": (0.2, 0.4),
         "merge": (0.1, 0.2),
     },
+    "swallowed": {"place": "room", "all_masked": False, "miss": (0.3, 0.5), "swallow": (0.5, 1.0)},
+    "swallowed-masked": {"place": "room", "all_masked": True, "miss": (0.3, 0.5), "swallow": (0.5, 1.0)},
     "room-changing": {"place": "room", "taken": (4, 7)},
     "million": {"place": "room", "points": (1_000_000, 1_000_000), "views": (16, 20), "width": (320, 320)},
     "many-views": {"place": "desk", "views": (180, 200), "width": (160, 160)},
@@ -170,7 +174,7 @@ def draw(name: str) -> Draw:
     numbers: dict[str, Any] = {"all_masked": bool(rng.uniform() < 0.35)}
     for key, usual in ANY.items():
         numbers[key] = _between(fixed.get(key, usual), rng.uniform())
-    for key in ("spans", "taken", "confused", "blurred"):
+    for key in ("spans", "taken", "confused", "blurred", "swallow"):
         if key in fixed:
             numbers[key] = _between(fixed[key], rng.uniform())
     numbers.update({key: fixed[key] for key in ("place", "all_masked", "levels") if key in fixed})

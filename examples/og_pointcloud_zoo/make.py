@@ -154,7 +154,9 @@ def _masked(
 ) -> list[tuple[Frame, NDArray[np.uint16]]]:
     """Frames with their masks; with levels each frame three times."""
     # Which object's mask each pixel is in: things alone; with levels also parts, and things with what stands on them.
-    noise = MaskNoise(draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px)
+    noise = MaskNoise(
+        draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px, swallow=draw.swallow
+    )
     noises = [
         noise if not blurred else _blurred(noise) for blurred in _stream(draw, MASKS).random(len(frames)) < draw.blurred
     ]

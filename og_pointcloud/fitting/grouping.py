@@ -24,14 +24,14 @@ ours.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
 
@@ -42,11 +42,18 @@ UNKNOWN_LIKENESS = 0.5
 @dataclass(frozen=True)
 class MaskGroups:
     """group: (masks,) int32, the group of each mask, -1 where the mask was left out (it spans objects, or shows
-    nothing). count: number of groups. spanning: (masks,) bool, masks that most views show as several things."""
+    nothing). count: number of groups. spanning: (masks,) bool, masks that most views show as several things, and those
+    of `with_spanning`, which keep their group: they are named as it is."""
 
     group: NDArray[np.int32]
     count: int
     spanning: NDArray[np.bool_]
+
+    @property
+    def told(self) -> NDArray[np.int32]:
+        """(masks,) int32, the group that each mask tells points to be of, -1 none: spanning masks tell of no single
+        one."""
+        return np.where(self.spanning, -1, self.group).astype(np.int32)
 
 
 def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np.int64] | None = None) -> MaskGroups:
@@ -62,6 +69,26 @@ def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np
     usable = ~spanning & (shown > 0)
     group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
     return MaskGroups(*_ordered(group, shown), spanning)
+
+
+def with_spanning(
+    groups: MaskGroups,
+    votes: ViewVotes,
+    mask_view: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    settings: GroupingSettings,
+) -> MaskGroups:
+    """The groups, masks that span two of them marked: where a proposer misses a cup, its table's mask may hold it.
+
+    A mask spans two groups if it holds most of what its view shows of either, and either is a good part of it. ids:
+    (n,) int32, the group that each point is of as far as views tell, below 0 none.
+    """
+    of_group = indicator(ids, groups.count).T
+    held = (votes.in_mask @ of_group).toarray()  # (masks, groups)
+    shown = (votes.vote @ of_group).toarray()[mask_view]
+    whole = np.asarray(votes.in_mask.sum(axis=1), np.float64).reshape(-1, 1)
+    has = (held > settings.container_share * shown) & (held > settings.spanning_share * whole)
+    return replace(groups, spanning=groups.spanning | ((has.sum(axis=1) > 1) & (groups.group >= 0)))
 
 
 def mask_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, NDArray[np.bool_]]:

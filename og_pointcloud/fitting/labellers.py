@@ -33,7 +33,7 @@ from og_pointcloud.fitting.learned.matching import (
 )
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import assign_points
+from og_pointcloud.fitting.membership import settled_points
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -78,8 +78,6 @@ def grouping(table: MaskTable, surface: Surface, settings: FitSettings, journal:
         sample = sample_of_points(surface.gaussians.xyz, settings.grouping.graph_points)
         groups = group_masks(table, settings.grouping, sample)
         votes = view_votes(table)
-    if groups.spanning.any():
-        journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     return _decided_by_views(table, votes, groups, surface, settings, journal)
 
 
@@ -215,7 +213,9 @@ def _decided_by_views(
     """
     with journal.stage("membership"):
         rgb = surface.scene.points.rgb
-        membership = assign_points(table, votes, groups, surface.neighborhood, settings.membership, rgb)
+        groups, membership = settled_points(table, votes, groups, surface.neighborhood, settings, rgb)
+    if groups.spanning.any():
+        journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     if membership.dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
     with journal.stage("association"):

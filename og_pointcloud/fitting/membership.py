@@ -17,6 +17,10 @@ counts as openly is measured by the scene's other points: in surfaces of several
 The clear points show what each view reports of each instance and of background, and these reports, with neighbors and
 colors, say what every point is likeliest of (view_reports.py).
 
+Where a proposer misses a cup, its pixels may lie in the mask of its table. What the points then are shows it: such a
+mask holds most of what its view sees of two groups. It is named as its own group still, but from then on tells points
+only that they are of one of the two, and they choose once more.
+
 Torn mask edges leave middling shares on the rim of an object, and views that tear it alike call it background. So do
 rays that slip past an edge on what lies behind. The two are told apart by place and color: a background point with a
 middling share becomes one of the instance where it adjoins points that are (hysteresis, as in Canny's edges). And by
@@ -39,13 +43,13 @@ from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
-from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.grouping import MaskGroups, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_reports import ViewReports, likely_states
 from og_pointcloud.fitting.view_votes import ViewVotes, VotesOfPoints, votes_of_points
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
-from og_pointcloud.settings import MembershipSettings
+from og_pointcloud.settings import FitSettings, MembershipSettings
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,24 @@ class Membership:
     scene: SceneVotes
 
 
+def settled_points(
+    table: MaskTable,
+    votes: ViewVotes,
+    groups: MaskGroups,
+    around: Neighborhood,
+    settings: FitSettings,
+    rgb: NDArray[np.uint8] | None = None,
+) -> tuple[MaskGroups, Membership]:
+    """Decide the state of every point of a scene, then once more with the masks that these states show to span two
+    groups, which tell of neither. Returns the groups with these masks marked, too."""
+    asked = around, settings.membership, rgb
+    first = assign_points(table, votes, groups, *asked)
+    known = with_spanning(groups, votes, table.mask_view, first.instance_ids, settings.grouping)
+    if (known.spanning == groups.spanning).all():
+        return groups, first
+    return known, assign_points(table, votes, known, *asked)
+
+
 def assign_points(
     table: MaskTable,
     votes: ViewVotes,
@@ -90,7 +112,7 @@ def assign_points(
     has_mask = views_with_masks(table, groups)
     # Points choose twice: among all groups, which shows those that are noise, and among the others.
     of_points = votes_of_points(votes)
-    asked = of_points, groups.group, table.mask_view, has_mask
+    asked = of_points, groups.told, table.mask_view, has_mask
     support = _support(*asked, np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     support = _support(*asked, ~dismissed, settings)
@@ -100,14 +122,14 @@ def assign_points(
     clear = _clear(support, openly, settings)
     weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
     # What each mask reports: its group, nothing, or that it spans several, under a number of its own after the groups.
-    reporting = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.group]
+    reporting = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.told]
     reporting[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
     of_masks, size = (reporting, table.mask_view), (votes.vote.shape[0], groups.count)
     likely, reports = likely_states(
         of_points, of_masks, size, clear, support.group, openly, around, weights, scene.reports if scene else None
     )
     possible = (support.share > settings.possible_share) & (support.share_openly > settings.possible_openly)
-    ids = _completed(likely.ids, support, possible, (table, groups.group), around, weights, settings)
+    ids = _completed(likely.ids, support, possible, (table, groups.told), around, weights, settings)
     certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids, certainty.astype(np.float32), likely.expected_iou(ids), rate.astype(np.float32), dismissed,
@@ -121,7 +143,7 @@ def assign_by_votes_alone(
     """(n,) the states of points that views agree on and of possible ones that adjoin them, as if they were seen
     openly alike. For a few views of many: they tell nothing of what each of them reports."""
     has_mask = views_with_masks(table, groups)
-    asked = votes_of_points(votes), groups.group, table.mask_view, has_mask
+    asked = votes_of_points(votes), groups.told, table.mask_view, has_mask
     support = _support(*asked, np.ones(groups.count, np.bool_), settings)
     _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), replace(settings, missed_chance=0.0))
     support = _support(*asked, ~dismissed, settings)
@@ -129,14 +151,14 @@ def assign_by_votes_alone(
     ids = np.where(support.total > 0, ids, UNOBSERVED).astype(np.int32)
     weights = around.adjoining.astype(np.float32)
     possible = support.share > settings.possible_share
-    return _completed(ids, support, possible, (table, groups.group), around, weights, settings)
+    return _completed(ids, support, possible, (table, groups.told), around, weights, settings)
 
 
 def views_with_masks(table: MaskTable, groups: MaskGroups) -> NDArray[np.bool_]:
     """(groups, views): whether a view has a mask of a group."""
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
-    grouped = groups.group >= 0
-    has_mask[groups.group[grouped], table.mask_view[grouped]] = True
+    told = groups.told
+    has_mask[told[told >= 0], table.mask_view[told >= 0]] = True
     return has_mask
 
 
