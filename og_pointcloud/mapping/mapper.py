@@ -175,11 +175,6 @@ class Mapper:
                 warnings.warn(f"change {number} of the journal fails ({type(error).__name__}: {error})", stacklevel=4)
         return journal
 
-    @property
-    def last_stamp(self) -> float:
-        """The latest stamp of all frames so far."""
-        return -1.0 if self._map is None else self._map.stamp
-
     def holds(self, stamp: float) -> bool:
         """Whether a frame of this stamp is in the map; of one before the last few thousand frames it is believed."""
         known = self._map
