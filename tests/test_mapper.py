@@ -407,6 +407,18 @@ def test_a_journal_takes_whatever_frames_are_given_as(tmp_path):
     assert [thing.points for thing in again.objects()] == [thing.points for thing in whole.objects()]
 
 
+def test_ids_that_a_snapshot_gave_are_not_given_again_after_a_kill(tmp_path):
+    first, *others = frames(THINGS)[:4]
+    mapper, _ = mapped([first], journal=tmp_path)  # which makes no object yet
+    given = len(mapper.snapshot().cloud.instances)
+    for _ in range(2):
+        again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    ids = [k for frame in others for k in again.integrate(frame).new]
+    assert given > 0
+    assert ids
+    assert min(ids) >= given
+
+
 def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
     given = [replace(frame, stamp=float(k // 2)) for k, frame in enumerate(frames(THINGS)[:4])]  # two cameras at a time
     mapper, _ = mapped(given, journal=tmp_path)

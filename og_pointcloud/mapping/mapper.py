@@ -168,7 +168,11 @@ class Mapper:
             if self._map is not None and number < self._map.sequence:
                 continue
             try:
-                self.correct(change) if isinstance(change, dict) else self.integrate(change)
+                if isinstance(change, int):
+                    assert self._map is not None
+                    self._map.tracks.next_id = max(self._map.tracks.next_id, change)
+                else:
+                    self.correct(change) if isinstance(change, dict) else self.integrate(change)
             except OgPointcloudError:
                 raise
             except Exception as error:  # it failed when it came first, too: a map in a queue went on then
@@ -306,6 +310,8 @@ class Mapper:
         wanted, count = matched_ids(
             visit.instance_ids, len(visit.instances), id_of_track[known.owners()[rows]], known.tracks.next_id
         )
+        if self._journal is not None and count > known.tracks.next_id:
+            self._journal.append(known.sequence, count)
         known.tracks.next_id = count
         return with_ids(visit, wanted, count)
 
