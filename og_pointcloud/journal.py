@@ -24,17 +24,17 @@ class LeftOut(Enum):
         "shapes of Gaussians", "scale, rotation and opacity of the Gaussians",
         "views are asked along the ray of each one's center",
     )
-    CHOICE_OF_SPLATS = "choice of splats", "choice of scale and opacity", "the file holds Gaussians"
+    CHOICE_OF_SPLATS = "choice of splats", "choice of scale", "the file holds Gaussians"
     CHOICE_OF_SCALE = (
         "choice of scale", "choice of the points' size",
         "too few views can judge others here: points are drawn {scale:g} spacings large",
     )
     CHOICE_IN_PAPER_MODE = (
-        "choice of splats, mode paper", "choice of scale and opacity",
+        "choice of splats, mode paper", "choice of scale",
         "mode paper draws points as full as trained Gaussians are",
     )
     CHOICE_POINTS = (
-        "points of the choice of splats", "{share:.0%} of the points in the choice of scale and opacity",
+        "points of the choice of splats", "{share:.0%} of the points in the choice of scale",
         "the rest are enough",
     )
     PIXELS_IN_PAPER_MODE = (
@@ -53,7 +53,7 @@ class LeftOut(Enum):
     SPANNING_MASKS = (
         "spanning masks", "{count} masks",
         "most views show each of them as several things; all that they tell is that a point is of one of these",
-    )  # fmt: skip
+    )
     CONTRADICTED_GROUPS = (
         "contradicted groups", "{count} of {total} groups of masks",
         "views that see their points mostly show no such mask, far more often than the proposer's misses explain",

@@ -28,6 +28,7 @@ from scenes import write_image, write_ply
 
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.formats.images import find_image
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 REAL_CAPTURES = {"seven_redkitchen": 100, "apc_shelf_B": 15, "ycb_0050": 20, "nuscenes_frame": 6}
@@ -285,6 +286,12 @@ def test_paths_out_of_the_folder_are_looked_for_inside(capture, path):
     edit_poses(folder, lambda content: content["frames"][0].update(file_path=path))
     image = read_capture(folder).views[0].image_rgb()
     assert image.max() > 0, "the black image outside the capture was opened"
+
+
+@pytest.mark.parametrize("path", ["", ".", "./", "images/..", "/"])
+def test_a_path_that_names_no_file_is_no_image_of_the_working_folder(tmp_path, monkeypatch, path):
+    monkeypatch.chdir(tmp_path)
+    assert find_image(Path(), path) is None
 
 
 def test_frames_without_a_pose_are_left_out_aloud(capture):

@@ -224,6 +224,10 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("fit", "capture", "-o", "s.ogpc", "--mode", "fast", "--mode", "fast"), "twice; expected once ("),
         (("pick", "s.ogpc", "--xyz", "1,2,3", "--view", "a"), "--view is given with --xyz alone"),
         (("compare", "a.ogpc", "b.ogpc", "--up", "z"), "--up is 'z' without --html"),
+        (("compare", "a.ogpc", "b.ogpc", "--html", "c.html", "--up", "w"), "--up is 'w'; expected 3 numbers"),
+        (("view", "a.ogpc", "--html", "c.html", "--up", "w"), "--up is 'w'; expected 3 numbers"),
+        (("serve", "a.ogpc", "--up", "w"), "--up is 'w'; expected 3 numbers"),
+        (("import", "house.e57", "-o", "house.ogpc"), "-o is house.ogpc; expected the name of a folder"),
         (("report", "capture", "--quick", "--knob", "mode"), "not allowed with"),
     ],
 )  # fmt: skip
@@ -416,6 +420,7 @@ def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys)
 @pytest.mark.parametrize("words", [
     "edit remove S.ogpc -o O.ply --xyz -1,0,5", "view S.ogpc --up -z",
     "find ATLAS mug --within -1,-1,0,1,1,2", "instances S.ogpc --up -0.1,0,1", "pick S.ogpc --xyz -1,2,3",
+    "pick S.ogpc --xyz -1.5e-05,0,1E+2",
 ])  # fmt: skip
 def test_negative_coordinates_are_values_and_no_options(words):
     arguments = build_parser().parse_args(words.split())

@@ -146,7 +146,8 @@ def test_images_that_cannot_be_used_are_named(tmp_path, capsys):
         ("good", "pinhole", PINHOLE, encoded(64, 48, ".jpg"), pose_of()),
     ]
     write_e57(tmp_path / "a.e57", images=images)
-    said = output_of(capsys, "import", tmp_path / "a.e57", "-o", tmp_path / "capture")
+    said = output_of(capsys, "import", tmp_path / "a.e57", "-o", tmp_path / "capture.v2")
+    (tmp_path / "capture.v2").rename(tmp_path / "capture")
     for line in (
         "lost: it has no pose", "round: it is neither pinhole nor spherical", "half: it spans 37 x 180 degrees",
         "torn: its JPEG or PNG is damaged", "flat: it is 64x48 pixels of 0.0 x", "1 images with poses",

@@ -183,6 +183,10 @@ def test_what_a_text_encoder_needs(model_folder, tmp_path):
     (folder / "tokenizer_config.json").unlink()
     with pytest.raises(OgPointcloudError, match="has pad_token None"):
         exporter.export_text_encoder(folder, tmp_path / "out", feature_space=SPACE)
+    for text in ('{"model": {}}', '{"model": []}', '{"model": {"vocab": [1]}}', '{"added_tokens": [{"id": 1}]}'):
+        (folder / "tokenizer.json").write_text(text)
+        with pytest.raises(OgPointcloudError, match=r"tokenizer\.json and tokenizer_config\.json cannot be read"):
+            exporter.export_text_encoder(folder, tmp_path / "out", feature_space=SPACE)
     assert not (tmp_path / "out").exists()
 
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from commands import run
-from frame_messages import messages_of, place_of, stamp_of, transform
+from frame_messages import image_message, messages_of, place_of, stamp_of, transform
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
 from og_pointcloud_ros.frames import FrameAssembler, image_array
 from og_pointcloud_ros.map_bags import BagFrames
@@ -91,6 +91,36 @@ def test_reasons_that_are_not_shown_are_counted(tmp_path, capsys, monkeypatch):
     assert [line for line in said.splitlines() if line.startswith("left out: ")][2:] == [
         "left out: 3 more, for 3 other reasons"
     ]
+
+
+def test_where_no_frame_is_taken_it_is_said_why_and_nothing_is_left(tmp_path, capsys):
+    given = [replace(frame, depth=0 * frame.depth) for frame in frames(THINGS)[:2]]
+    out = tmp_path / "room.ogpc"
+    code, _, said = run(capsys, "map", write_bag(tmp_path / "drive", given), "-o", out)
+    assert code == 2
+    assert said.count("has no depth, and the map has no points yet") == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive"]
+
+
+def as_gray(make, frame):
+    messages = messages_of(make, frame)
+    return messages | {"color": image_message(make, frame.rgb[..., 0], "mono8", stamp_of(frame))}
+
+
+def as_halved(make, frame):
+    messages = messages_of(make, frame)
+    return messages | {"color": image_message(make, frame.rgb[::2, ::2], "rgb8", stamp_of(frame))}
+
+
+def test_gray_images_color_points_gray_and_those_of_another_size_none(tmp_path):
+    given = frames(THINGS)[:2]
+    gray = write_bag(tmp_path / "gray", given, messages=as_gray)
+    for frame, read in zip(given, BagFrames(gray), strict=True):
+        np.testing.assert_array_equal(read.rgb, np.repeat(frame.rgb[..., :1], 3, axis=2))
+    with pytest.warns(UserWarning, match=r"color images are uint8 .*: colors are left out") as said:
+        read = list(BagFrames(write_bag(tmp_path / "halved", given, messages=as_halved)))
+    assert ([frame.rgb for frame in read], len(said)) == ([None, None], 1)
+    assert og.Mapper(feature_space=SPACE).integrate(read[0])
 
 
 def test_frames_of_a_bag_are_those_that_were_recorded(tmp_path):

@@ -369,9 +369,9 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
     torn = folder / "frames.log"
     torn.write_bytes(torn.read_bytes() + map_journal.MAGIC + b"half a frame")
     mapper = og.Mapper(feature_space=SPACE, journal=folder)
-    assert mapper.last_stamp >= done
+    assert mapper.holds(done)
     for frame in given:
-        if frame.stamp > mapper.last_stamp:
+        if not mapper.holds(frame.stamp):
             mapper.integrate(frame)
     whole, _ = mapped(given)
     one, other = mapper.snapshot().cloud, whole.snapshot().cloud
@@ -405,6 +405,18 @@ def test_a_journal_takes_whatever_frames_are_given_as(tmp_path):
     again = og.Mapper(feature_space=SPACE, journal=tmp_path)
     assert again.points == whole.points
     assert [thing.points for thing in again.objects()] == [thing.points for thing in whole.objects()]
+
+
+def test_ids_that_a_snapshot_gave_are_not_given_again_after_a_kill(tmp_path):
+    first, *others = frames(THINGS)[:4]
+    mapper, _ = mapped([first], journal=tmp_path)  # which makes no object yet
+    given = len(mapper.snapshot().cloud.instances)
+    for _ in range(2):
+        again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    ids = [k for frame in others for k in again.integrate(frame).new]
+    assert given > 0
+    assert ids
+    assert min(ids) >= given
 
 
 def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
@@ -452,7 +464,7 @@ def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path
     np.testing.assert_array_equal(mapper._map.points.xyz, xyz, "a correction that was not written moved the map")
     mapper.integrate(third)
     again = og.Mapper(feature_space=SPACE, journal=tmp_path)
-    assert (again.last_stamp, again.points) == (third.stamp, mapper.points)
+    assert (again.holds(third.stamp), again.points) == (True, mapper.points)
 
 
 def test_a_whole_map_that_cannot_be_written_costs_no_frame(tmp_path, monkeypatch):
@@ -518,16 +530,19 @@ def test_a_queue_never_blocks_and_says_what_it_drops():
     assert len(seen) == 4
     assert len(said) == 1
     assert "has no camera" in said[0]
-    broken = FrameQueue(mapper, on_change=lambda change: 1 / 0, on_drop=said.append)
-    for frame in given[:2]:
-        broken.put(frame)
-    broken.close()
-    assert [text.split(":")[1] for text in said[-2:]] == [" ZeroDivisionError"] * 2
+    for failing in (lambda change: 1 / 0, lambda change: mapper.correct([])):
+        broken = FrameQueue(mapper, on_change=failing, on_drop=said.append)
+        for frame in given[:2]:
+            broken.put(frame)
+        broken.close()
+    assert [text.split(":")[:2] for text in said[1:]] == [
+        ["a frame went in, but on_change failed", f" {kind}"] for kind in 2 * ["ZeroDivisionError"] + 2 * ["SceneError"]
+    ]
     deaf = FrameQueue(mapper, on_change=seen.append, on_drop=lambda text: 1 / 0)
     for frame in (replace(given[0], camera=None), given[1]):
         deaf.put(frame)
     deaf.close()
-    assert (len(seen), deaf.idle) == (5, True)
+    assert len(seen) == 5
     said.clear()
     slow = FrameQueue(mapper, max_age=0.0, on_drop=said.append)
     slow.put(given[0])
@@ -535,6 +550,23 @@ def test_a_queue_never_blocks_and_says_what_it_drops():
     slow.close()
     assert slow.dropped == 1
     assert "1 dropped so far" in said[-1]
+
+
+def test_a_driver_may_fill_its_buffers_again_behind_a_queue():
+    given = frames(THINGS)[:4]
+    buffer = {name: getattr(given[0], name).copy() for name in ("masks", "features", "depth", "rgb")}
+    pose = given[0].camera.world_to_camera.copy()
+    queue = FrameQueue(og.Mapper(feature_space=SPACE), max_age=60.0)
+    with queue.lock:  # nothing is taken in before all buffers were filled again
+        for frame in given:
+            for name, array in buffer.items():
+                array[...] = getattr(frame, name)
+            pose[...] = frame.camera.world_to_camera
+            queue.put(replace(frame, **buffer, camera=replace(frame.camera, world_to_camera=pose)))
+    queue.close()
+    whole, _ = mapped(given)
+    np.testing.assert_array_equal(queue.mapper._map.points.xyz, whole._map.points.xyz)
+    assert [thing.views for thing in queue.mapper.objects()] == [thing.views for thing in whole.objects()]
 
 
 def test_a_saved_map_is_a_file_like_any_other(grown, tmp_path):

@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -13,6 +12,8 @@ import fake_ros
 from frame_messages import messages_of, place_of, stamp_of
 from og_pointcloud_ros import ros_messages
 from visits import BIN, CHEST, CRATE, SPACE, frames, moved
+
+from og_pointcloud.mapping.frame_queue import FrameQueue
 
 BEFORE, AFTER = [CHEST, BIN, CRATE], [CHEST, BIN, moved(CRATE, (-0.9, 0.5, 0.0))]
 
@@ -37,8 +38,8 @@ def send(node, given, *, placed=True, without=()):
 
 def settled(node):
     """Wait until the queue has worked off what it has."""
-    while not node._queue.idle:
-        time.sleep(0.001)
+    node._queue.close()
+    node._queue = FrameQueue(node._queue.mapper, max_age=60.0, on_change=node._on_change, on_drop=node._warn)
     return node
 
 

@@ -200,8 +200,9 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
     camera = Camera(40, 30, 25.0, 40.0, 3.0, 28.0, np.eye(4))
     view = View("view", camera, np.full((30, 40), -1, np.int32), np.zeros((0, 4), np.float32))
     cloud = tiled_cloud(points, 0.3, WorkFolder(tmp_path))
-    drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3)  # so faint that nothing hides anything
-    everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32))
+    drawing = tiles._Drawing(1.0, 0.1, 0.3)
+    # So faint that nothing hides anything.
+    everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32), 0.01)
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
     rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
     assert len(shows) > 250
@@ -219,7 +220,7 @@ def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch, tmp_path):
     cloud = tiled_cloud(
         Points(xyz, np.zeros(3)), 0.00625, WorkFolder(tmp_path)
     )  # a quarter of a pixel, half of FINEST_PX
-    drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625)
+    drawing = tiles._Drawing(0.5, 0.1, 0.00625)
     rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
     assert inside == 40_000
     assert len(rows) == pytest.approx(10_000, rel=0.05)

@@ -502,6 +502,9 @@ def test_a_dataset_names_its_scene_without_its_folder_and_opens_no_other(bundle,
         with pytest.raises(OgPointcloudError, match="was not opened here and is not in this folder"):
             og.segment(stranger, ["apple"])
     assert opened == []
+    nothing = pv.PolyData(np.zeros((1, 3)))
+    nothing.field_data[SCENE_FIELD] = np.zeros(0)
+    assert carried_scene(nothing) is None
     monkeypatch.chdir(bundle.parent)
     assert carried_scene(stranger) == Path(bundle.name)
 

@@ -362,14 +362,20 @@ def test_a_map_keeps_its_ids(monday, updated):
 
 
 @pytest.mark.slow
-def test_what_comes_back_is_known_again(monday, updated):
+@pytest.mark.parametrize("by", [(0.0, 0.0, 0.0), (0.5, 1.1, 0.0)], ids=["where it was", "elsewhere"])
+def test_what_comes_back_is_known_again(monday, updated, by):
+    """The map in between has no point of it: it is new, and has not moved."""
     bin_ = instance_of(monday, BIN)
-    back = [*AFTER, moved(BIN, (0.5, 1.1, 0.0))]
+    back = [*AFTER, moved(BIN, by)]
+    visit = og.fit(scene(back, seed=9), progress=False)
+    assert og.compare(updated.cloud, visit).to_dict() == {
+        "gone": [], "new": [instance_of(visit, back[-1])], "moved": [], "unseen": []
+    }  # fmt: skip
     again = og.update(updated.cloud, scene(back, seed=9), progress=False)
-    assert [moved.id for moved in again.changes.moved] == [bin_]
-    assert again.changes.new == ()
+    assert again.changes.to_dict() == {"gone": [], "new": [bin_], "moved": [], "unseen": []}
     assert instance_of(again.cloud, back[-1]) == bin_
-    assert bin_ not in MapRecord.of(again.cloud).gone
+    record = MapRecord.of(again.cloud)
+    assert bin_ not in {**record.gone, **record.moved_from}
 
 
 def test_a_part_of_the_place_leaves_the_rest_as_it_was(monday):

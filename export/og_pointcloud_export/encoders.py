@@ -250,10 +250,16 @@ def _pad_id(source: Path, description: dict[str, Any]) -> int:
     file, config = source / "tokenizer_config.json", read_config(source, "tokenizer_config.json")
     named = config.get("pad_token")
     token = named.get("content") if isinstance(named, dict) else named
-    added = {entry["content"]: entry["id"] for entry in description.get("added_tokens") or []}
-    vocabulary = description["model"]["vocab"]
-    ids = vocabulary if isinstance(vocabulary, dict) else {entry[0]: id for id, entry in enumerate(vocabulary)}
-    id = {**ids, **added}.get(token)
+    try:
+        added = {entry["content"]: entry["id"] for entry in description.get("added_tokens") or []}
+        vocabulary = description["model"]["vocab"]
+        ids = vocabulary if isinstance(vocabulary, dict) else {entry[0]: id for id, entry in enumerate(vocabulary)}
+        id = {**ids, **added}.get(token)
+    except (LookupError, TypeError) as error:
+        raise OgPointcloudError(
+            f"{source / text_encoder.TOKENIZER} and {file.name} cannot be read together ({error!r:.80}); expected what "
+            "transformers writes: a model with a vocab, and tokens with content and id"
+        ) from None
     if id is None or config.get("padding_side", "right") != "right":
         raise OgPointcloudError(
             f"{file} has pad_token {token!r:.40}, padding_side {config.get('padding_side')!r:.20}; expected a token of "

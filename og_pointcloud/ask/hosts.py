@@ -79,7 +79,10 @@ def carried_scene(pcd: Any) -> Path | None:
     """
     if _host(pcd) != "pyvista" or SCENE_FIELD not in pcd.field_data:
         return None
-    named = str(np.asarray(pcd.field_data[SCENE_FIELD]).ravel()[0])
+    names = np.asarray(pcd.field_data[SCENE_FIELD]).ravel()
+    if not len(names):
+        return None
+    named = str(names[0])
     if path := _NAMED.get(named):
         return path
     beside = Path(re.split(r"[/\\]", named.partition("#")[0])[-1])

@@ -7,7 +7,7 @@ other words, and with the scene's word bank where it has one: an instance is sel
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, fields
 from typing import Any, overload
 
@@ -176,7 +176,9 @@ def _match(
 
 def _rivals(scene: LabelledScene, query: Vocabulary, against: Labels, text_features: TextFeatures) -> Vocabulary:
     """The words that compete with the query, without itself."""
-    none_wanted = isinstance(against, Sequence) and not len(against)  # []; None asks for all known words
+    if isinstance(against, Iterable) and not isinstance(against, Sized):  # it says how many it has only once
+        against = list(against)
+    none_wanted = isinstance(against, Sized) and not len(against)  # []; None asks for all known words
     words = query if none_wanted else scene.known_words(against, text_features)
     others = [index for index, name in enumerate(words.names) if name != query.names[0]]
     if not others:

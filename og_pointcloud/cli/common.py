@@ -40,7 +40,7 @@ class Parser(argparse.ArgumentParser):
         # Abbreviations would make `--mask` mean one thing today and another once an option is added.
         super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
         self.register("action", None, Once)
-        self._negative_number_matcher = re.compile(r"-([\d.,-]+|[xyz])$")  # -1,2,3 and -z are values, no options
+        self._negative_number_matcher = re.compile(r"-([\d.,][\d.,eE+-]*|[xyz])$")  # -1,2e-5,3 and -z are values
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
@@ -125,7 +125,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         if path is None or not (endings := outputs_of(action)):
             continue
         option = action.option_strings[0]
-        if path.suffix not in endings:
+        if path.suffix not in endings and "" not in endings:  # "": a folder, which may be called as one likes
             raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
         check_output(option, path, inputs)
         if path.resolve() in taken:

@@ -28,12 +28,12 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.up and not arguments.html:
         raise OgPointcloudError(f"--up is '{arguments.up}' without --html; expected the page whose view it turns")
+    up = np.array(direction(arguments.up or "z"), np.float64)  # refused before the work
     before, after = load(arguments.before), load(arguments.after)
     changes = compare(before, after)
     if arguments.html:
         from og_pointcloud.show.changes_page import write_changes_page
 
-        up = np.array(direction(arguments.up or "z"), np.float64)
         write_changes_page(arguments.html, before.cloud, after.cloud, changes, up)
     print_result(arguments, changes.to_dict(), lambda _: print_changes(changes))
     if arguments.json:

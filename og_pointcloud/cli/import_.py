@@ -28,6 +28,8 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     if arguments.result.suffix.lower() == ".e57":
+        if arguments.output.suffix == ".ogpc":
+            raise OgPointcloudError(f"-o is {arguments.output}; expected the name of a folder: what an .e57 becomes")
         unpack(arguments.result, arguments.output)
         return
     if arguments.output.suffix != ".ogpc":

@@ -46,13 +46,15 @@ def run(arguments: argparse.Namespace) -> None:
             taken += 1
         except OgPointcloudError as error:
             refused[str(error)] = refused.get(str(error), 0) + 1
-    mapper.save(arguments.output)
-    shutil.rmtree(work)
     left_out = [*frames.dropped.items(), *refused.items()]
     for why, count in left_out[:SHOWN]:
         print(f"left out: {count} x {why}", file=sys.stderr)
     if rest := left_out[SHOWN:]:
         print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)
+    if not taken and not arguments.resume:  # nothing to save, as the next line says, nor to go on with
+        shutil.rmtree(work)
+    mapper.save(arguments.output)
+    shutil.rmtree(work)
     made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
     print(", ".join(counted(count, thing) for count, thing in made))
     print(f"wrote {arguments.output}")

@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.formats.points import read_points
     from og_pointcloud.show.live import LiveScene
 
+    up = direction(arguments.up or "z")  # refused before the work
     served = import_plugin("og_pointcloud.show.serve", "serve")
     shown = read_points(arguments.cloud) if arguments.cloud else None
     labels = names_in(arguments.labels)
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         bundles = titles(arguments.bundles).items()
         scenes = {title: LiveScene(load(path), shown, *words) for title, path in bundles}
-    page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, direction(arguments.up or "z")))
+    page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, up))
     try:
         print(f"{page.url}  (Ctrl-C ends it)", flush=True)
         if page.is_open:

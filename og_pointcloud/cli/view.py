@@ -32,6 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.show.page import Look, write_page
     from og_pointcloud.show.viewpoint import choose_viewpoint
 
+    up = np.array(common.direction(arguments.up or "z"), np.float64)  # refused before the work
     journal = Journal(progress=False)
     with journal.stage("load"):
         scene = og.load(arguments.bundle)
@@ -41,7 +42,6 @@ def run(arguments: argparse.Namespace) -> None:
         words = scene.known_words(labels, arguments.text_features) if arguments.instances else labels
         result = og.segment(asked, words, scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
-    up = np.array(common.direction(arguments.up or "z"), np.float64)
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no point to show; expected at least one")

@@ -67,11 +67,6 @@ class MaskTable:
         length = np.linalg.norm(wide, axis=1, keepdims=True)
         return (wide / np.where(length > 0, length, 1)).astype(np.float32)
 
-    @property
-    def seen(self) -> NDArray[np.float64]:
-        """(n,) float64: pixels' worth of blending weight of each Gaussian over all views, masked or not."""
-        return np.asarray(self.weights.sum(axis=0) + self.outside.sum(axis=0), np.float64)
-
     def of_points(self, rows: NDArray[np.int64]) -> MaskTable:
         """The table of some of its points, in ascending order."""
         if len(rows) == self.exposure.shape[1]:
@@ -263,7 +258,7 @@ def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], coun
 
 @njit(cache=True)
 def _weights_by_instance(indptr, indices, data, instance_ids, count):  # noqa: ANN001, ANN202
-    """As above, entry by entry: a product with a sparse indicator would make a copy of the table's size."""
+    """As above, entry by entry: a product with a sparse indicator of float64 would copy all values to float64."""
     rows = len(indptr) - 1
     sums = np.zeros((rows, count))
     for row in range(rows):

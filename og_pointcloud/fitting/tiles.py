@@ -67,7 +67,7 @@ then differ, 1.4 % at 0.5 and 17 % at 1, where a point no longer has a splat of 
 MOST_SPLATS = 4_000_000
 """A view that would draw more than this is thinned further; drawing takes about 300 bytes a splat."""
 CHOICE_POINTS = 1_000_000
-"""Size and opacity of the splats are chosen on so many points, spread over the cloud."""
+"""The size of the splats is chosen on so many points, spread over the cloud."""
 LEAST_TILE, LARGEST_TILE = 125_000, 2_000_000
 """Points of a tile where memory decides, in steps of twice as many, so that an interrupted fit finds the same tiles
 although the free memory is never the same. Smaller tiles are mostly margin, larger ones save no time."""
@@ -179,21 +179,20 @@ def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class _Drawing:
-    """How points are drawn, the same in every tile. scale, opacity: of their splats, scale in spacings. near, typical:
-    depth of the near plane and the cloud's typical spacing, scene units."""
+    """How points are drawn, the same in every tile. scale: of their splats, in spacings. near, typical: depth of the
+    near plane and the cloud's typical spacing, scene units."""
 
     scale: float
-    opacity: float
     near: float
     typical: float
 
-    def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
+    def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32], opacity: float) -> Gaussians:
         """Splats of some points, each ``larger`` times as large as it would be."""
-        return isotropic(cloud.points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, self.opacity)
+        return isotropic(cloud.points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, opacity)
 
 
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
-    """Size and opacity of the splats, once for all tiles."""
+    """The size of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, (view.camera for view in views)), float(np.median(cloud.spacing))
     few, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
@@ -205,7 +204,7 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
     choice = choose_scale(few, drawn, thickness, views, near, settings, journal)
     note_scale(choice, journal)
-    return _Drawing(choice.scale, geometry.opacity, near, typical)
+    return _Drawing(choice.scale, near, typical)
 
 
 @dataclass(frozen=True)
@@ -319,7 +318,7 @@ def _entries(
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
         return np.zeros(0, ENTRY), counts, np.zeros((2, DIFFERENCES))
-    splats = drawing.splats(cloud, rows, larger)
+    splats = drawing.splats(cloud, rows, larger, settings.geometry.opacity)
     thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
     table = mask_table(splats, [view], drawing.near, thickness, by_sight=True)
     camera = view.camera

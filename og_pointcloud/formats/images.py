@@ -61,6 +61,8 @@ def find_image(capture: Path, path: str) -> Path | None:
     inside = posixpath.normpath(path)
     if inside.startswith(("/", "..")):  # absolute paths of the machine that wrote the file, or worse
         inside = posixpath.basename(inside)
+    if inside in ("", "."):
+        return None
     for folder in ("", *IMAGE_FOLDERS):
         file = capture / folder / inside
         candidates = (file, *(file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES))

@@ -6,7 +6,7 @@ views tell whether it was there already. By instance, over the points that show 
 
     gone     most of them are seen through later, from two places
     new      most of them lie where the earlier visit had looked through, from two places
-    moved    a new instance that looks like a gone one
+    moved    a new instance that looks like a gone one; like one that had left before, it is new, and back
     unseen   so few of them are looked at later that nothing is known; or the later visit's cloud leaves out so much
              of what stands near them that it may have left them out by chance
 
@@ -118,13 +118,15 @@ class Comparison:
     """changes, and what they rest on. evidence: about the earlier visit's points. nearest: for each later point the row
     of the nearest earlier one, -1 where none lies on its surface. pieces: for instances that came or moved, later id ->
     later id of the thing that it is a piece of (itself, for one in one piece); gone_pieces: the same by earlier ids,
-    for what moved."""
+    for what moved. back: of those in ``changes.new``, later id -> earlier id of what had left before the earlier visit.
+    """
 
     changes: Changes
     evidence: Evidence
     nearest: NDArray[np.int64]
     pieces: dict[int, int]
     gone_pieces: dict[int, int]
+    back: dict[int, int]
 
 
 def compare_visits(
@@ -226,21 +228,24 @@ def _decide(
     gone_alone = [thing for g, thing in enumerate(gone[:count]) if g not in pairs and thing.surely]
     new_alone = [thing for n, thing in enumerate(new) if n not in pairs.values() and thing.surely and thing.pieces]
     gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
+    # The earlier map has no point of what is back: it came, and did not move.
+    back = {new[n].pieces[0]: gone[g].pieces[0] for g, n in pairs.items() if g >= count}
     # What only likely left, and looks like nothing that came, may be missing by chance: nothing is known of it.
     unseen |= left
     unseen[[piece for thing in gone_alone for piece in thing.pieces] + list(gone_pieces)] = False
     changes = Changes(
         gone=tuple(sorted(piece for thing in gone_alone for piece in thing.pieces)),
-        new=tuple(thing.pieces[0] for thing in new_alone),
+        new=tuple(sorted([*back, *(thing.pieces[0] for thing in new_alone)])),
         moved=tuple(
             Moved(gone[g].pieces[0], gone[g].look.place, new[n].look.place, new[n].pieces[0])
             for g, n in sorted(pairs.items())
+            if g < count
         ),
         unseen=tuple(np.flatnonzero(unseen & (earlier.count(earlier.cloud.instance_ids >= 0) > 0)).tolist()),
     )  # of what left in earlier visits the table has rows without points: these are not unseen
     come = [*new_alone, *(new[n] for n in pairs.values())]
     pieces = {piece: thing.pieces[0] for thing in come for piece in thing.pieces}
-    return Comparison(changes, of_earlier, nearest, pieces, gone_pieces)
+    return Comparison(changes, of_earlier, nearest, pieces, gone_pieces, back)
 
 
 def _unmoved(

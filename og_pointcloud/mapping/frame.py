@@ -105,7 +105,7 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
 
 
 def in_arrays(frame: Frame) -> Frame:
-    """A frame that passed all checks, with plain arrays for whatever it was given as: tensors, lists, clouds."""
+    """A frame with plain arrays for whatever it was given as: tensors, lists, clouds."""
     given = {name: getattr(frame, name) for name in ("masks", "features", "depth", "rgb")}
     arrays = {name: numbers_of(value) for name, value in given.items() if value is not None}
     return replace(frame, **arrays, cloud=None if frame.cloud is None else world_points(frame.cloud))

@@ -8,9 +8,11 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
+from copy import deepcopy
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.mapping.frame import Frame
+from og_pointcloud.mapping.frame import Frame, in_arrays
 from og_pointcloud.mapping.mapper import FrameChange, Mapper
 
 
@@ -18,8 +20,8 @@ class FrameQueue:
     """Feeds a mapper in a thread of its own, in the order in which frames come.
 
     max_age: seconds that a frame may wait. on_change: called, in that thread, with each frame's change. on_drop: called
-    with a message for each frame that was dropped, for its age or because it was refused; None: a warning. lock: held
-    while a frame goes in; hold it to use the mapper, or to put another in its place.
+    with a message for each frame that was dropped, for its age or because it was refused, and where on_change fails;
+    None: a warning. lock: held while a frame goes in; hold it to use the mapper, or to put another in its place.
     """
 
     def __init__(
@@ -33,19 +35,15 @@ class FrameQueue:
         self.mapper, self.max_age, self.dropped = mapper, max_age, 0
         self._on_change, self._on_drop = on_change or (lambda change: None), on_drop or warnings.warn
         self._waiting: queue.SimpleQueue[tuple[float, Frame] | None] = queue.SimpleQueue()
-        self.lock, self._put, self._done = threading.Lock(), 0, 0
+        self.lock = threading.Lock()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def put(self, frame: Frame) -> None:
-        """Hand a frame over; returns at once."""
-        self._put += 1
+        """Hand a frame over; returns at once. It is copied: a driver may write into its arrays again."""
+        with suppress(Exception):  # what is no frame of arrays is refused, and told, in its turn
+            frame = deepcopy(in_arrays(frame))
         self._waiting.put((time.monotonic(), frame))
-
-    @property
-    def idle(self) -> bool:
-        """Whether all that was put has been worked off."""
-        return self._done == self._put
 
     def close(self) -> None:
         """Work off what waits and is young enough, and end the thread."""
@@ -58,17 +56,20 @@ class FrameQueue:
                 self._take(*waiting)
             except Exception:  # of on_drop: nobody is left to be told, and the thread lives on
                 traceback.print_exc()
-            self._done += 1
 
     def _take(self, arrived: float, frame: Frame) -> None:
         if time.monotonic() - arrived > self.max_age:
             self.dropped += 1
             self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
             return
+        change = None
         try:
             with self.lock:
-                self._on_change(self.mapper.integrate(frame))
-        except OgPointcloudError as error:
-            self._on_drop(f"a frame was refused: {error}")
-        except Exception as error:  # of a listener, say; the thread lives on, and the next frame goes in
-            self._on_drop(f"a frame failed: {type(error).__name__}: {error}")
+                change = self.mapper.integrate(frame)
+                self._on_change(change)
+        except Exception as error:  # the thread lives on, and the next frame goes in
+            why = f"failed: {type(error).__name__}: {error}"
+            if change is not None:
+                self._on_drop(f"a frame went in, but on_change {why}")
+            else:
+                self._on_drop(f"a frame {f'was refused: {error}' if isinstance(error, OgPointcloudError) else why}")

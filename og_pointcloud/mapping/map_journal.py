@@ -1,11 +1,11 @@
 """A map on disk while it grows: a kill -9 at any moment loses at most the frame being integrated.
 
-The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each change, a frame
-or a correction, is appended with its number; a torn last one is cut off. ``map.state`` is the whole map at some number,
-replaced in one step; the log then begins anew. A mapper that is started with the folder reads the state and makes the
-changes of the log again: this gives the very map that was left, and the space on disk grows with the map, not with
-time. Nothing is pickled: a record is a tree of plain values and of the dataclasses named in KINDS, as JSON, and the
-arrays in it, as .npy.
+The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each change is
+appended with its number: a frame, a correction, or the next id after those that a snapshot gave; a torn last one is cut
+off. ``map.state`` is the whole map at some number, replaced in one step; the log then begins anew. A mapper that is
+started with the folder reads the state and makes the changes of the log again: this gives the very map that was left,
+and the space on disk grows with the map, not with time. Nothing is pickled: a record is a tree of plain values and of
+the dataclasses named in KINDS, as JSON, and the arrays in it, as .npy.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class MapJournal:
             )
         return known
 
-    def changes(self) -> Iterator[tuple[int, Frame | Poses]]:
+    def changes(self) -> Iterator[tuple[int, Frame | Poses | int]]:
         """The changes in the log, in their order, with their numbers: those below the map's own are in it already, as
         after a kill between the two files. A torn one at the end is cut off, so that new ones follow whole ones."""
         if not self._log.is_file():
@@ -119,7 +119,7 @@ class MapJournal:
         if whole < self._log.stat().st_size:
             os.truncate(self._log, whole)
 
-    def append(self, number: int, change: Frame | Poses) -> None:
+    def append(self, number: int, change: Frame | Poses | int) -> None:
         """Write a change behind the others. Where that fails, as on a full disk, the log stays as it was."""
         if isinstance(change, Frame):
             change = in_arrays(change)

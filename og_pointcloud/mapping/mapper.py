@@ -168,17 +168,16 @@ class Mapper:
             if self._map is not None and number < self._map.sequence:
                 continue
             try:
-                self.correct(change) if isinstance(change, dict) else self.integrate(change)
+                if isinstance(change, int):
+                    assert self._map is not None
+                    self._map.tracks.next_id = max(self._map.tracks.next_id, change)
+                else:
+                    self.correct(change) if isinstance(change, dict) else self.integrate(change)
             except OgPointcloudError:
                 raise
             except Exception as error:  # it failed when it came first, too: a map in a queue went on then
                 warnings.warn(f"change {number} of the journal fails ({type(error).__name__}: {error})", stacklevel=4)
         return journal
-
-    @property
-    def last_stamp(self) -> float:
-        """The latest stamp of all frames so far."""
-        return -1.0 if self._map is None else self._map.stamp
 
     def holds(self, stamp: float) -> bool:
         """Whether a frame of this stamp is in the map; of one before the last few thousand frames it is believed."""
@@ -311,6 +310,8 @@ class Mapper:
         wanted, count = matched_ids(
             visit.instance_ids, len(visit.instances), id_of_track[known.owners()[rows]], known.tracks.next_id
         )
+        if self._journal is not None and count > known.tracks.next_id:
+            self._journal.append(known.sequence, count)
         known.tracks.next_id = count
         return with_ids(visit, wanted, count)
 

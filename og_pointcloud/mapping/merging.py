@@ -117,8 +117,8 @@ def _staying(earlier: Visit, found: Comparison) -> tuple[NDArray[np.bool_], NDAr
 
 
 def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:
-    """(later instances,) their ids in the map: its old id for what moved, a fresh one for what came, for what was there
-    already the id that most of its surface has, and a fresh one too for what the map did not know.
+    """(later instances,) their ids in the map: its old id for what moved or is back, a fresh one for what came, for
+    what was there already the id that most of its surface has, and a fresh one too for what the map did not know.
     """
     count = fresh = len(earlier.cloud.instances)
     on_map = (found.nearest >= 0) & stays[found.nearest]
@@ -127,9 +127,10 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
     shared = later.shared(np.where(on_map, on_none, UNOBSERVED), count + 1)
     best, most = (np.asarray(of).ravel() for of in (shared.argmax(axis=1), shared.max(axis=1).toarray()))
     was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))
-    map_ids, came = np.where(was_there, best, -1), {moved.now: moved.id for moved in found.changes.moved}
+    map_ids = np.where(was_there, best, -1)
+    came = {moved.now: moved.id for moved in found.changes.moved} | found.back
     for k in range(len(map_ids)):
-        # All pieces of a thing that came get one id: the one it had, if it moved, else the first piece's fresh one.
+        # All pieces of a thing that came get one id: the one that it had, if any, else the first piece's fresh one.
         thing = found.pieces.get(k)
         if thing is not None:
             map_ids[k] = came.get(thing, -1)
@@ -227,7 +228,8 @@ def _note(
         record.last_seen[k] = entry.stamp
     for moved in found.changes.moved:
         record.moved_from[moved.id] = tuple(moved.before.tolist())
-        record.gone.pop(moved.id, None)
+    for k in found.back.values():
+        del record.gone[k]
     # Smaller pieces of what moved are rows without points too: the thing goes on under the id of its largest piece.
     for k in {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}:
         record.gone[k] = earlier.look(k, earlier.rows[k])

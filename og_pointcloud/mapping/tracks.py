@@ -260,14 +260,14 @@ class Tracks:
         """Add the masks (M,) to what is known of their tracks; see `observe` for the rest."""
         unit = directions(features)  # zeros where a feature has no direction
         new, again = [], []
+        # No two masks are of one track: a mask has more than half of what shows of its own, and tracks that this frame
+        # joined lie mostly in one mask.
         for m in np.flatnonzero(of_mask >= 0):
             k = int(self.root[of_mask[m]])
             track = self.tracks[k]
             if unit[m].any():
                 track.total = of_masks[m] * unit[m] + (0 if track.total is None else track.total)
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
-            if k in again or k in new:  # a second mask of the same frame: by a join, it is no further view
-                continue
             track.first = track.first if track.masks > 1 else when[1]
             track.views, (track.last_seen, track.sequence) = track.views + 1, when
             if track.id < 0 and track.views >= CONFIRMED_VIEWS:

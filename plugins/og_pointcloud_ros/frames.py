@@ -7,6 +7,7 @@ features of masks 1, 2, ... CameraInfo counts pixel centers at whole numbers.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -64,6 +65,7 @@ class FrameAssembler:
     def __init__(self, whole: Iterable[str] = WHOLE, *, rectified: bool = False) -> None:
         self.whole, self.rectified, self.waiting = tuple(whole), rectified, dict[int, _Parts]()
         self._info: Any = None
+        self._warned = False  # of colors that are left out
 
     def add(self, role: str, message: Any) -> None:
         """Take a message of a role: "info" or a field of `_Parts`. SceneError for what it is not."""
@@ -83,7 +85,10 @@ class FrameAssembler:
             parts.features = np.asarray(rows["feature"], np.float32).reshape(rows.size, *width)
         else:
             parts.frame_id = message.header.frame_id
-            setattr(parts, role, image_array(message))
+            pixels = image_array(message)
+            if role == "color" and pixels.ndim == 2:  # of a gray camera
+                pixels = np.repeat(pixels[..., None], 3, axis=2)
+            setattr(parts, role, pixels)
 
     def is_whole(self, stamp: int) -> bool:
         """Whether all that a frame waits for has come, the camera among it."""
@@ -107,7 +112,20 @@ class FrameAssembler:
         # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
         masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
         features = parts.features if has_masks else None
-        return Frame(camera, masks, features, depth, rgb=parts.color, stamp=stamp / NANOSECONDS)
+        return Frame(camera, masks, features, depth, rgb=self._rgb(parts.color, camera), stamp=stamp / NANOSECONDS)
+
+    def _rgb(self, color: NDArray[Any] | None, camera: Camera) -> NDArray[np.uint8] | None:
+        """Colors that fit the camera's image; None where they do not, which is said once: they are no frame's need."""
+        if color is None or (color.dtype == np.uint8 and color.shape[:2] == (camera.height, camera.width)):
+            return color
+        if not self._warned:
+            warnings.warn(
+                f"color images are {color.dtype} {color.shape}; expected uint8 ({camera.height}, {camera.width}, 3), "
+                "as camera_info says of depth and masks: colors are left out",
+                stacklevel=3,
+            )
+            self._warned = True
+        return None
 
     def forget(self, stamp: int) -> None:
         """Let go of a stamp."""
