@@ -63,7 +63,7 @@ class LabelledScene:
     manifest: the file's, with counts, parity figures, provenance; None and empty for a scene in memory.
     instance_ids: (n,) int32, row of ``instances``, -1 background, -2 unobserved. vocabulary: the words that may be
     asked as strings, None without any. feature_space: name of the encoder that label vectors must come from.
-    Its own arrays are read-only: every later answer is made of them.
+    Its own arrays are read-only, as every later answer is made of them: Open3D's Vector3dVector wants `xyz.copy()`.
 
     >>> scene = og.LabelledScene.from_cloud(cloud)  # of `LabelledCloud`'s example; og.load reads a file
     >>> scene.instances_at(np.array([[0.02, 0, 1], [1, 0.1, 1], [9, 9, 9]]))
