@@ -64,7 +64,7 @@ class FeatureSpace:
         return f"feature space '{self.name}'" + (f" (width {self.width})" if self.width else "")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InstanceTable:
     """What is known of K instances; row k of each array is instance id k.
 
@@ -175,7 +175,7 @@ def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> N
         raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is a part of itself, through part_of")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Vocabulary:
     """Words with their text vectors. names: unique strings; vectors: (len(names), D) float32, any length.
 
@@ -204,7 +204,7 @@ class Vocabulary:
             raise OgPointcloudError(f"the words are {[*self.names]!r:.80}; expected strings")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WordBank:
     """Everyday words of the scene's encoder: how a text that does not fit scores, and what else a thing may be.
 

@@ -16,7 +16,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
 
@@ -70,12 +70,31 @@ def take_arrays(record: Any, *names: str) -> None:
                 raise SceneError(f"{name} is {value!r:.80}; expected an array: its rows differ in length") from None
 
 
+def numbers_of(value: Any) -> NDArray[Any]:
+    """np.asarray that takes torch's tensors too; of no array, such as rows of different lengths, a scalar None, which
+    fits no expected shape."""
+    of_torch = any(kind.__module__.partition(".")[0] == "torch" for kind in type(value).__mro__)
+    try:
+        return np.asarray(dense_tensor(value) if of_torch else value)
+    except ValueError:
+        return np.array(None)
+
+
+def dense_tensor(tensor: Any) -> NDArray[Any] | None:
+    """A torch tensor as an array, wherever it lies; None for what is none, or is sparse."""
+    try:
+        tensor = tensor.detach().cpu()
+        return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
+    except (AttributeError, TypeError, RuntimeError):
+        return None
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera without distortion.
 
-    width, height: pixels. fx, fy, cx, cy: pixels (pixel centers at +0.5).
-    world_to_camera: (4, 4) float64 rigid transform from the scene's local frame, OpenCV axes.
+    width, height: pixels, whole numbers. fx, fy, cx, cy: pixels (pixel centers at +0.5).
+    world_to_camera: (4, 4) float64 rigid transform from the scene's local frame, OpenCV axes; copied.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
@@ -94,10 +113,7 @@ class Camera:
     world_to_camera: DoubleArray
 
     def __post_init__(self) -> None:
-        pose = np.asarray(self.world_to_camera)
-        if pose.shape != (4, 4) or pose.dtype.kind not in "fiu" or not np.isfinite(pose).all():
-            raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
-        pose = pose.astype(np.float64, copy=False)
+        pose = pose_matrix(self.world_to_camera, "camera pose", ": drop or repair this view")
         object.__setattr__(self, "world_to_camera", pose)
         numbers = (self.width, self.height, *self.intrinsics)
         if not all(isinstance(number, Real) for number in numbers):
@@ -109,11 +125,13 @@ class Camera:
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
         # Sizes come before focal lengths, which are held against them.
-        if not (1 <= self.width <= LONGEST_SIDE and 1 <= self.height <= LONGEST_SIDE):
+        if not all(1 <= side <= LONGEST_SIDE and side == int(side) for side in (self.width, self.height)):
             raise SceneError(
                 f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
-                f"most {LONGEST_SIDE} a side: check w and h of the pose file"
+                f"most {LONGEST_SIDE} a side, in whole numbers: check w and h of the pose file"
             )
+        for name in ("width", "height"):
+            object.__setattr__(self, name, int(getattr(self, name)))  # 64.0 is no shape
         if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
             raise SceneError(
                 f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, fx and fy > 0 "
@@ -158,7 +176,7 @@ class Camera:
         return -rotation.T @ translation
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CutMasks:
     """For a view that is one of several cut from a photograph: its masks are parts of the photograph's.
 
@@ -197,7 +215,7 @@ class View:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise SceneError(f"a view is called {self.name!r:.80}; expected text, as its image's file stem is")
-        take_arrays(self, "mask_features", "mask_tracks")
+        take_arrays(self, "image", "mask_features", "mask_tracks")
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
@@ -293,7 +311,8 @@ class Points:
         rotation: FloatArray | None = None,
         opacity: FloatArray | None = None,
     ) -> Points:
-        """Points from world coordinates (n, 3) of any float type; the median becomes the origin."""
+        """Points from world coordinates (n, 3) of any float type; the median becomes the origin. xyz and rgb are
+        copied."""
         world = np.asarray(xyz)
         if world.ndim != 2 or world.shape[1] != 3 or world.dtype.kind not in "fiu":
             raise SceneError(f"points are an array of {world.dtype} {world.shape}; expected numbers (points, 3)")
@@ -308,7 +327,8 @@ class Points:
                 f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38: "
                 "remove the outliers, or scale the cloud and its poses"
             )
-        return cls((world - origin).astype(np.float32), origin, rgb, scale, rotation, opacity)
+        colors = rgb.copy() if isinstance(rgb, np.ndarray) else rgb
+        return cls((world - origin).astype(np.float32), origin, colors, scale, rotation, opacity)
 
     def __post_init__(self) -> None:
         take_arrays(self, "xyz", "origin", "rgb", "scale", "rotation", "opacity")
@@ -362,6 +382,21 @@ class Points:
         return self.xyz.astype(np.float64) + self.origin
 
 
+def pose_matrix(pose: ArrayLike, what: str = "pose", cure: str = ", cloud to world") -> DoubleArray:
+    """A pose (4, 4) as float64, a copy. SceneError, which calls it ``what``, for numbers that are not finite and a last
+    row other than 0 0 0 1."""
+    matrix = numbers_of(pose)
+    if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
+        seen = f"{matrix.dtype} {matrix.shape}, {matrix.tolist()!s:.60}"
+        raise SceneError(f"{what} is {seen}; expected a finite 4x4 matrix{cure}")
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise SceneError(
+            f"the last row of {what} is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is "
+            "the translation (transposed, perhaps?)"
+        )
+    return matrix.astype(np.float64)
+
+
 def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
     """Largest entry of R R' - 1 for a matrix (3, 3), 0 for orthonormal rows, NaN where it overflows; and det R."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -376,6 +411,21 @@ def float32_step(xyz_world: NDArray[np.floating]) -> float:
     if single.size == 0 or not np.array_equal(single, xyz_world):
         return 0.0
     return float(np.spacing(np.median(np.abs(single).max(axis=1))))
+
+
+def rounded_pose(pose: ArrayLike, spacing: float) -> str:
+    """Why a pose (4, 4) is too coarse for points that lie ``spacing`` apart, having been kept as float32 among map
+    coordinates; "" where it is not."""
+    matrix = numbers_of(pose)
+    # Whole numbers, as of an offset that someone chose, tell nothing; a turn whose numbers are all float32's does.
+    fractions = matrix if matrix.dtype == np.float32 else matrix[:3, :3]
+    step = float32_step(matrix.reshape(1, -1)) if (fractions % 1).any() else 0.0
+    if step <= spacing:
+        return ""
+    return (
+        f"float32 rounded the pose to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give it as "
+        "float64, of numbers that never were float32"
+    )
 
 
 def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the cloud first") -> None:
@@ -405,9 +455,10 @@ def _require(fits: NDArray[np.bool_], values: FloatArray, name: str, expected: s
         raise SceneError(f"{name} of Gaussian {row} is {values[row].tolist()}; expected {expected}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """Points and the views of them. feature_space names the encoder of the mask features, e.g. ``clip-vit-b32``."""
+    """Points and the views of them, which may come from any iterable. feature_space names the encoder of the mask
+    features, e.g. ``clip-vit-b32``."""
 
     points: Points
     views: tuple[View, ...]
@@ -417,6 +468,7 @@ class Scene:
     __repr__ = brief
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "views", tuple(self.views or ()))
         if not self.views:
             raise SceneError("the scene has 0 views; expected at least one posed image with a mask")
         if not len(self.points):

@@ -13,7 +13,7 @@ from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.ply import read_ply
 
 WORDS = ["apple", "pear", "plum"]
@@ -140,8 +140,11 @@ def test_integer_and_half_precision_tensors(asked):
         assert np.array_equal(og.segment(tensor, WORDS, scene).labels, expected)
     with pytest.raises(SceneError, match=r"Tensor of float64 \(3,\)"):
         og.segment(torch.zeros(3), WORDS, scene)
-    with pytest.raises(SceneError, match="no points"):
-        og.segment(torch.device("cpu"), WORDS, scene)
+    for what in (torch.device("cpu"), torch.eye(3).to_sparse()):
+        with pytest.raises(SceneError, match="no points"):
+            og.segment(what, WORDS, scene)
+    with pytest.raises(OgPointcloudError, match=r"the place is .*; expected three finite world coordinates"):
+        og.pick(scene, torch.ones(3).to_sparse())
 
 
 # LAS out

@@ -22,7 +22,7 @@ from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.collection.index import index
 from og_pointcloud.collection.lance import write_lance
 from og_pointcloud.collection.store import Atlas
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.show.findings_page import picture, png_bytes
 
 WIDTH = 32
@@ -162,6 +162,19 @@ def test_vectors_are_asked_of_the_scenes_of_their_encoder(folder):
     assert [f.scene for f in collection.find("chair", scenes="a", text_features=other_width)] == ["a"]
     with pytest.raises(OgPointcloudError, match="'seat' is not among the 8 words"):
         collection.find("seat", text_features=(Vocabulary(("seat",), np.ones((1, 5), np.float32)), "another/encoder"))
+
+
+def test_given_vectors_are_asked_whatever_words_they_go_by(folder):
+    collection = indexed(folder, {"a": scene(["desk", "chair"], bank=BANK), "b": scene(["lamp"], bank=BANK)})
+    for name in ("desk", "seat"):  # also where the scenes know the word
+        best = collection.find({name: 3 * ENCODER["chair"]})[0]
+        expected = collection.find("chair")[0]
+        assert (best.scene, best.instance, best.word) == (expected.scene, expected.instance, name) == ("a", 1, name)
+        assert best.score == pytest.approx(expected.score, abs=1e-6)
+    with pytest.raises(FeatureSpaceError, match=r"the label vectors are .*\(width 5\); expected .*\(width 32\)"):
+        collection.find({"chair": np.ones(5)})
+    with pytest.raises(FeatureSpaceError, match="the vector of 'chair' is zero"):
+        collection.find({"chair": np.zeros(WIDTH)})
 
 
 def test_box_and_scenes_restrict(folder):

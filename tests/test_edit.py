@@ -115,6 +115,17 @@ def test_a_click_that_missed_and_a_word_that_fits_nothing_are_refused(scene, spl
         og.edit.remove(scene, nothing, tmp_path / "out.ply", cloud=splats)
 
 
+def test_what_was_found_in_another_scene_is_refused(scene, splats, tmp_path):
+    other = LabelledScene.from_cloud(room(700, seed=4))
+    selection = og.select(other, WORDS[1])
+    hit = og.pick(other, other.xyz[np.flatnonzero(other.instance_ids == 2)[0]])
+    for what in (selection, selection[0], hit):
+        with pytest.raises(OgPointcloudError, match=f"the {type(what).__name__} .* they are of two scenes"):
+            og.edit.remove(scene, what, tmp_path / "out.ply", cloud=splats)
+    again = LabelledScene.from_cloud(replace(scene.cloud))
+    assert og.edit.remove(again, og.select(scene, WORDS[1]), tmp_path / "out.ply", cloud=splats).instances
+
+
 def test_without_a_cloud_the_scenes_own_points_are_edited(scene, tmp_path):
     done = og.edit.remove(scene, [0, 1], tmp_path / "out.ply")
     points = og.read_points(done.path)
@@ -286,6 +297,14 @@ def test_colors_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_pat
 def test_a_color_that_is_none_is_refused(scene, tmp_path, color):
     with pytest.raises(OgPointcloudError, match="0 to 255"):
         og.edit.recolor(scene, 3, tmp_path / "out.ply", color)
+
+
+@pytest.mark.parametrize("color", [(1.0, 0, 0), (1.0, 1.0, 1.0), (0.5, 0.2, 0), (127.5, 0, 0)])
+def test_a_color_of_another_scale_is_refused(scene, tmp_path, color):
+    with pytest.raises(OgPointcloudError, match=r"color is .*; expected whole numbers: scale to 0..255"):
+        og.edit.recolor(scene, 3, tmp_path / "out.ply", color)
+    for right in ((1, 0, 0), (40.0, 70.0, 220.0), (0.0, 0.0, 0.0)):
+        assert og.edit.recolor(scene, 3, tmp_path / "out.ply", right).changed
 
 
 # Insertion --------------------------------------------------------------------------------------------------------

@@ -160,7 +160,9 @@ def test_a_loop_closure_moves_what_its_frames_brought():
         np.sort(mapper.snapshot().xyz[:, 2])[::50], np.sort(right.snapshot().xyz[:, 2])[::50], atol=0.01
     )
     with pytest.raises(SceneError, match="rotation"):
-        mapper.correct({0.0: 2 * np.eye(4)})
+        mapper.correct({0.0: np.diag([2.0, 2, 2, 1])})
+    with pytest.raises(SceneError, match=r"the last row of camera pose is .* expected 0 0 0 1"):
+        mapper.correct({0.0: given[0].camera.world_to_camera.T})
     with pytest.raises(SceneError, match="poses are a list; expected a dict"):
         mapper.correct([np.eye(4)])
     with pytest.raises(SceneError, match="a pose is of frame 'a'; expected the frame's stamp"):
@@ -211,6 +213,15 @@ def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said):
         mapper.integrate(bad_frames()[said])
     assert mapper.snapshot() is before
     assert mapper.points == sequence
+
+
+def test_a_pose_that_float32_rounded_is_told():
+    frame = frames(THINGS)[0]
+    mapped_camera = og.in_world(frame.camera, (431234.567, 5412345.678, 312.345))
+    og.Mapper(feature_space=SPACE).integrate(replace(frame, camera=mapped_camera))
+    rounded = replace(mapped_camera, world_to_camera=mapped_camera.world_to_camera.astype(np.float32))
+    with pytest.warns(UserWarning, match="frames may be placed wrongly; float32 rounded the pose to steps of"):
+        og.Mapper(feature_space=SPACE).integrate(replace(frame, camera=rounded))
 
 
 def test_a_camera_close_to_a_wall_is_of_the_place():

@@ -28,14 +28,14 @@ WORDS = ["apple", "pear", "plum"]
 
 
 def legacy_cloud(scene):
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene.xyz))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene.xyz.copy()))
     cloud.normals = open3d.utility.Vector3dVector(np.tile([0.0, 0, 1], (len(scene.xyz), 1)))
     return cloud
 
 
 def legacy_mesh(scene):
     faces = open3d.utility.Vector3iVector(np.array([[0, 1, 2], [2, 3, 4]]))
-    return open3d.geometry.TriangleMesh(open3d.utility.Vector3dVector(scene.xyz), faces)
+    return open3d.geometry.TriangleMesh(open3d.utility.Vector3dVector(scene.xyz.copy()), faces)
 
 
 # Segmenting

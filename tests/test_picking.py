@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -205,6 +206,19 @@ def test_places_find_what_query_points_find(tmp_path):
 def test_bad_places_are_refused(where, uv, text):
     with pytest.raises(OgPointcloudError, match=text):
         pick(room(), where, uv)
+
+
+def test_a_camera_that_float32_rounded_is_told_where_it_matters():
+    origin = np.array([431234.567, 5412345.678, 312.345])
+    mapped = replace(room(), origin=origin)
+    exact = in_world(FROM_ABOVE, origin)
+    rounded = replace(exact, world_to_camera=exact.world_to_camera.astype(np.float32))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pick(mapped, exact, (20, 15))
+        pick(room(), replace(FROM_ABOVE, world_to_camera=FROM_ABOVE.world_to_camera.astype(np.float32)), (20, 15))
+    with pytest.warns(UserWarning, match=r"another point may be hit; float32 rounded the pose to steps of 0.5"):
+        pick(mapped, rounded, (20, 15))
 
 
 @pytest.mark.parametrize(("camera", "origin"), [(None, (0, 0, 0)), (AHEAD, 5), (AHEAD, np.eye(3)), (AHEAD, ("a",) * 3)])

@@ -104,6 +104,28 @@ def test_a_result_converts_with_and_without_points(scene):
     assert tuple(empty.field_data["og_names"]) == ("apple",)
 
 
+@pytest.mark.parametrize("make", [lambda path: og.segment(path, ["apple"]).to_pyvista(), pv.read])
+def test_an_edited_mesh_changes_no_later_answer(bundle, make):
+    before = og.segment(bundle, ["apple"])
+    mesh = make(bundle)
+    mesh.points += [100, 0, 0]
+    for name in mesh.point_data:
+        mesh[name][...] = 0
+    after = og.segment(bundle, ["apple"])
+    for name in ("xyz", "labels", "scores", "instances"):
+        assert np.array_equal(getattr(after, name), getattr(before, name)), name
+
+
+def test_an_edited_mesh_leaves_its_result(scene):
+    result = og.segment(scene.xyz[:50], ["apple"], scene)
+    kept = [result.xyz.copy(), result.labels.copy()]
+    mesh = result.to_pyvista()
+    mesh.points += [100, 0, 0]
+    mesh["og_label"][...] = 7
+    assert np.array_equal(result.xyz, kept[0])
+    assert np.array_equal(result.labels, kept[1])
+
+
 def test_nothing_labelled_is_said(scene):
     far = pv.PolyData(scene.xyz + 100)
     with pytest.warns(UserWarning, match="too far from the scene"):

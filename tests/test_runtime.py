@@ -9,6 +9,7 @@ import types
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -117,11 +118,39 @@ def test_many_points_are_asked_in_runs(scene, monkeypatch):
 
 def test_answers_are_told_apart_and_kept_in_sets(scene):
     """By identity: arrays have no one truth value."""
-    for make in (lambda: og.segment(scene), lambda: og.pick(scene, scene.xyz[0]), lambda: og.Frame(None, np.eye(3))):
+    bank = unit_rows(60, seed=1)
+    for make in (
+        lambda: og.segment(scene),
+        lambda: og.pick(scene, scene.xyz[0]),
+        lambda: og.Frame(None, np.eye(3)),
+        lambda: og.axis_aligned_box(scene.xyz),
+        lambda: replace(scene.cloud.instances),
+        lambda: og.Vocabulary(("a", "b"), bank[:2]),
+        lambda: og.WordBank(bank),
+    ):
         one, other = make(), make()
         assert one != other
         assert {one, other} == {other, one}
         assert [other, one].index(one) == 1
+
+
+def test_a_scene_keeps_its_arrays_and_a_result_has_its_own(scene):
+    loaded = og.load(scene.path)
+    in_memory = og.LabelledScene.from_cloud(room())
+    for asked in (loaded, in_memory):
+        for array in (asked.xyz, asked.instance_ids, asked.certainty):
+            with pytest.raises(ValueError, match="read-only"):
+                array[:] = 0
+        for pcd in (asked, room(700, seed=4), asked.xyz):
+            make = partial(og.segment, pcd, WORDS, asked)
+            expected, edited = make(), make()
+            for name in ("xyz", "labels", "scores", "instances", "reasons", "certainty"):
+                getattr(edited, name)[:] = 0
+            for name in ("xyz", "labels", "scores", "instances", "reasons", "certainty"):
+                np.testing.assert_array_equal(getattr(make(), name), getattr(expected, name))
+    with pytest.raises(ValueError, match="read-only"):
+        loaded.cloud.instance_ids[:] = 0
+    assert in_memory.cloud.instance_ids.flags.writeable, "an array of the caller's stays as it was"
 
 
 def test_a_scene_offers_its_parts(scene, bundle):
@@ -176,6 +205,9 @@ def test_what_is_no_scene(tmp_path):
             og.load(path)
         with pytest.raises(BundleError, match=r"is not a file; expected a \.ogpc file"):
             og.segment(np.zeros((1, 3)), ["apple"], path)
+    for path in (None, 3, ["a.ogpc"]):
+        with pytest.raises(BundleError, match=r"is not a file; expected a \.ogpc file"):
+            og.load(path)
 
 
 def test_a_graph_that_is_not_ours_is_refused(scene):
@@ -262,6 +294,27 @@ def test_clouds_of_other_libraries_are_read_without_importing_them(scene, monkey
     assert imported is None or isinstance(imported, types.ModuleType)
 
 
+def test_a_cloud_that_was_read_is_asked_in_world_coordinates(tmp_path):
+    mapped = runtime.as_scene(CLOUDS["map coordinates"])
+    points = og.read_points(og.segment(mapped, WORDS).save(tmp_path / "own.ply"))
+    assert np.abs(points.xyz).max() < 100
+    result = og.segment(points, WORDS, mapped)
+    np.testing.assert_array_equal(result.xyz, points.xyz_world)
+    np.testing.assert_array_equal(result.instances, mapped.instance_ids)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".pcd"])
+def test_a_file_without_points_is_answered_as_an_array_without_is(scene, tmp_path, ending):
+    path = tmp_path / f"none{ending}"
+    if ending == ".ply":
+        quietly(np.zeros((0, 3)), ["apple"], scene).save(path)
+    else:
+        path.write_text("VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 0\nHEIGHT 1\nPOINTS 0\n"
+                        "DATA ascii\n")  # fmt: skip
+    with pytest.warns(UserWarning, match="no point has a label: the cloud has 0 points"):
+        assert len(og.segment(path, ["apple"], scene)) == 0
+
+
 def test_empty_results_convert_too(scene, tmp_path):
     result = quietly(np.zeros((0, 3)), ["apple"], scene)
     assert result.counts() == {"apple": 0}
@@ -310,6 +363,23 @@ def test_words_come_from_the_vocabulary_a_mapping_a_file_or_what_was_read(scene,
     assert og.segment(scene).names == WORDS
     assert og.segment(bare, text_features=tmp_path / "t.npz").names == WORDS
     assert og.segment(scene, "café").names == ("café",)
+
+
+def test_a_word_may_be_an_array_without_dimensions(scene):
+    assert og.segment(scene, np.array("apple")).names == ("apple",)
+    with pytest.raises(OgPointcloudError, match=r"is a .*; expected words, or name -> vector"):
+        og.segment(scene, np.array(5))
+
+
+@pytest.mark.parametrize("given", [{"apple": np.ones(WIDTH)}, Vocabulary(("a",), np.ones((1, WIDTH))), ("a", "b"), 3])
+def test_what_are_no_text_features_is_refused(scene, given, tmp_path):
+    said = r"text_features are a \w+; expected an .npz file, or what og.read_text_features returned"
+    with pytest.raises(OgPointcloudError, match=said):
+        og.segment(scene, ["apple"], text_features=given)
+    og.write_bundle(scene.cloud, tmp_path / "scans" / "a.ogpc")
+    collection = og.Collection.index(tmp_path / "scans", tmp_path / "atlas", progress=False)
+    with pytest.raises(OgPointcloudError, match=said):
+        collection.find("apple", text_features=given)
 
 
 def test_a_files_words_come_before_the_scenes(scene):
@@ -375,6 +445,8 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
         result.mask("plum")
     with pytest.raises(OgPointcloudError, match=r"expected one of .npz, .ply, .las, .laz, .glb"):
         result.save(tmp_path / "out.txt")
+    with pytest.raises(OgPointcloudError, match=r"the file to save is 3; expected a name, with one of .npz, .ply"):
+        result.save(3)
     with pytest.raises(OgPointcloudError, match=r"splats are a str; expected those of og.read_points"):
         result.save(tmp_path / "out.glb", splats="kitchen.ply")
 
@@ -482,6 +554,28 @@ def test_a_cloud_of_another_unit_or_precision_that_lies_near_the_scene_is_told(s
         og.segment(bring(mapped.xyz), ["apple", "pear"], mapped)
 
 
+@pytest.mark.parametrize("as_given", [lambda pose: pose, lambda pose: pose.astype(np.float64), np.ndarray.tolist])
+def test_a_pose_that_float32_rounded_is_told_where_it_matters(scene, as_given):
+    origin = np.array([431234.567, 5412345.678, 312.345])
+    mapped = runtime.as_scene(replace(scene.cloud, origin=origin))
+    turn, about = np.eye(4), 0.3
+    turn[:2, :2] = [[np.cos(about), -np.sin(about)], [np.sin(about), np.cos(about)]]
+    pose = turn.copy()
+    pose[:3, 3] = origin
+    sensor = scene.xyz @ turn[:3, :3]
+    shift = np.eye(4)
+    shift[:3, 3] = [431234, 5412345, 312]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        og.segment(sensor, WORDS, mapped, pose=pose)
+        og.segment(sensor, WORDS, scene, pose=as_given(turn.astype(np.float32)))
+        og.segment(mapped.xyz - shift[:3, 3], WORDS, mapped, pose=as_given(shift.astype(np.float32)))  # which is exact
+    with pytest.warns(
+        UserWarning, match=r"float32 rounded the pose to steps of 0.5, the scene's points lie 0.05 apart"
+    ):
+        og.segment(sensor, WORDS, mapped, pose=as_given(pose.astype(np.float32)))
+
+
 # Poses, crops, densities, noise, streams
 
 POSE = np.array([[0, -1, 0, 250.5], [1, 0, 0, -3.25], [0, 0, 1, 1e6], [0, 0, 0, 1]])
@@ -562,7 +656,21 @@ def test_certainty_is_that_of_the_nearest_point(scene):
         assert result.certainty.dtype == np.float32
         np.testing.assert_allclose(result.certainty, wanted, rtol=1e-6)
     columns = {name: getattr(result, name)[::3] for name in ("xyz", "labels", "scores", "instances", "reasons")}
-    np.testing.assert_array_equal(replace(result, **columns).certainty, result.certainty[::3])
+    of_rows = replace(result, **columns, certainty_of=result.certainty[::3])
+    np.testing.assert_array_equal(of_rows.certainty, result.certainty[::3])
+    with pytest.raises(OgPointcloudError, match="certainty is of 902 points, the result has 301; expected one a point"):
+        _ = replace(result, **columns).certainty
+
+
+def test_certainty_is_of_the_points_asked_about_whatever_becomes_of_them(scene, tmp_path):
+    points = queries(scene.cloud, 200).astype(np.float64)
+    for make in (lambda: og.segment(scene, WORDS), lambda: quietly(points, WORDS, scene, max_distance=0.05)):
+        expected = make().certainty
+        assert expected.any()
+        result = make()
+        result.xyz[:] += 100
+        result.instances[:] = TOO_FAR
+        assert np.array_equal(np.load(result.save(tmp_path / "out.npz"))["certainty"], expected)
 
 
 def test_a_scene_that_knows_no_certainty_says_none(scene, tmp_path):
@@ -616,6 +724,7 @@ def test_scenes_and_answers_go_to_other_processes(scene, bundle):
     answer = ask(points)
     sent = pickle.loads(pickle.dumps((ask, answer, og.select(ask.scene, "apple"))))
     assert same(sent[1], answer)
+    assert len(pickle.dumps(ask(points[:1]))) < 3000, "an answer takes no scene along"
     assert same(sent[0](points), answer)
     np.testing.assert_array_equal(sent[1].certainty, answer.certainty)
     assert sent[2].to_json() == og.select(scene, "apple").to_json()

@@ -40,6 +40,42 @@ def test_the_middle_of_the_first_pixel_is_at_a_half():
     np.testing.assert_array_equal(camera.shows(uv_px), [True, True, False, False, False])
 
 
+TURNED = rigid(Rotation.from_rotvec([0.1, 0.4, -0.2]).as_matrix(), np.array([1.0, 2, 3]))
+
+
+def test_a_transposed_pose_is_refused():
+    with pytest.raises(SceneError, match=r"the last row of camera pose is \[1.0, 2.0, 3.0, 1.0\]; expected 0 0 0 1"):
+        Camera(64, 48, 50.0, 60.0, 30.0, 25.0, TURNED.T)
+
+
+def test_a_camera_keeps_its_pose_when_the_buffer_that_it_came_in_is_used_again():
+    buffer = TURNED.copy()
+    camera = Camera(64, 48, 50.0, 60.0, 30.0, 25.0, buffer)
+    buffer[:3, 3] = 9
+    np.testing.assert_array_equal(camera.world_to_camera, TURNED)
+    rgb = np.full((2, 3), 7, np.uint8)
+    points = Points.from_world(np.eye(2, 3), rgb=rgb)
+    rgb[:] = 9
+    assert (points.rgb == 7).all()
+
+
+def test_a_pose_may_be_a_list_or_a_tensor():
+    torch = pytest.importorskip("torch")
+    for pose in (TURNED.tolist(), torch.from_numpy(TURNED.copy()).requires_grad_()):
+        np.testing.assert_array_equal(Camera(64, 48, 50.0, 60.0, 30.0, 25.0, pose).world_to_camera, TURNED)
+    for pose in (None, [[1, 0], [1]], torch.eye(4).to_sparse()):
+        with pytest.raises(SceneError, match=r"camera pose is .*; expected a finite 4x4 matrix: drop or repair this"):
+            Camera(64, 48, 50.0, 60.0, 30.0, 25.0, pose)
+
+
+def test_an_images_sides_are_whole_numbers():
+    camera = Camera(64.0, np.float32(48), 50.0, 60.0, 30.0, 25.0, np.eye(4))
+    assert (type(camera.width), type(camera.height), camera.width, camera.height) == (int, int, 64, 48)
+    for side in (48.5, np.nan, np.inf):
+        with pytest.raises(SceneError, match=f"camera image is 64x{side}; expected at least 1x1 .* in whole numbers"):
+            Camera(64, side, 50.0, 60.0, 30.0, 25.0, np.eye(4))
+
+
 def test_no_points_are_projected_to_no_pixels():
     uv_px, depth = Camera(4, 3, 2.0, 2.0, 2.0, 1.5, np.eye(4)).project(np.empty((0, 3), np.float32))
     assert (uv_px.shape, depth.shape) == ((0, 2), (0,))
@@ -115,6 +151,7 @@ def test_views_without_a_name_and_scenes_without_a_point_are_refused():
         (lambda view: Points(np.zeros((1, 3), np.float32), [0, 0, 0], [[1, 2, 3]]), "rgb is int64; expected uint8"),
         (lambda view: replace(view, mask_features=[[1.0, 0]]), r"float64 \(1, 2\); .*pass features.astype"),
         (lambda view: replace(view, mask_features=[[1.0], [1.0, 0]]), "mask_features is .*rows differ in length"),
+        (lambda view: replace(view, image=[[[1, 2, 3]]]).image_rgb(), r"image is int64 \(1, 1, 3\); expected uint8"),
         (lambda view: replace(view, mask_tracks=[0.5] * view.mask_count), "mask tracks are float64"),
         (lambda view: Vocabulary(("a",), [["x", 0]]), "vocabulary vectors is <U21; expected float32"),
         (lambda view: Vocabulary(("a", "b"), [[1, 0]]), "2 names and vectors of shape"),
@@ -125,6 +162,14 @@ def test_lists_are_told_as_the_arrays_that_they_are(made, said):
     view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32))
     with pytest.raises(OgPointcloudError, match=said):
         made(view)
+
+
+def test_views_may_come_from_a_generator():
+    views = [_view(name="a"), _view(name="b")]
+    scene = Scene(Points(np.zeros((1, 3), np.float32), np.zeros(3)), (view for view in views), "letters")  # type: ignore[arg-type]
+    assert scene.views == tuple(views)
+    with pytest.raises(SceneError, match="the scene has 0 views"):
+        Scene(scene.points, iter(()), "letters")  # type: ignore[arg-type]
 
 
 def test_lists_of_what_is_right_are_taken():

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import quaternion_of, upright_axes
-from og_pointcloud.scene import DoubleArray
+from og_pointcloud.scene import DoubleArray, numbers_of
 
 LARGEST = 1e100
 """Volumes of boxes at larger coordinates would be no numbers."""
@@ -48,7 +47,7 @@ WIDEST = 1 << 19
 """Most voxels on either side of the origin: a coordinate then fits the 21 bits that `_connected` gives it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Box:
     """center: (3,) float64. size: (3,) float64, full lengths along the rows of axes. axes: (3, 3) float64, unit rows,
     right-handed. In the frame and unit of the points it was made from.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import StrPath
+from og_pointcloud.scene import Points, dense_tensor
 
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
@@ -28,15 +29,17 @@ NAMES_FIELD = "og_names"
 def world_points(pcd: Any) -> NDArray[np.float64]:
     """(N, 3) float64 world coordinates of a cloud; rows may be NaN.
 
-    pcd: an array of shape (N, 3); a torch tensor of that shape, wherever it lies; an Open3D point cloud or mesh, legacy
-    or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a PointCloud2 message; or the path of a
-    geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices. SceneError for anything else;
-    MissingExtraError where reading needs a library that is not installed.
+    pcd: an array of shape (N, 3); a torch tensor of that shape, wherever it lies; the Points of `read_points`; an
+    Open3D point cloud or mesh, legacy or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a
+    PointCloud2 message; or the path of a geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices.
+    SceneError for anything else; MissingExtraError where reading needs a library that is not installed.
     """
     if isinstance(pcd, (str, os.PathLike)):
         from og_pointcloud.formats.points import read_places
 
         return read_places(pcd)
+    if isinstance(pcd, Points):
+        return pcd.xyz_world
     kind = type(pcd).__name__
     if kind.endswith("PointCloud2"):  # rclpy's type, and rosbags' sensor_msgs__msg__PointCloud2
         return _checked(import_plugin("og_pointcloud_ros", "ros").from_pointcloud2(pcd), kind)
@@ -47,15 +50,6 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     if values is None:
         raise SceneError(f"a {kind} of {host} has no points that can be asked: give its points as (N, 3)")
     return _checked(values, kind)
-
-
-def numbers_of(value: Any) -> NDArray[Any]:
-    """np.asarray that takes torch's tensors too; of no array, such as rows of different lengths, a scalar None, which
-    fits no expected shape."""
-    try:
-        return np.asarray(_READERS["torch"](value) if _host(value) == "torch" else value)
-    except ValueError:
-        return np.array(None)
 
 
 _NAMED: dict[str, Path] = {}
@@ -124,17 +118,12 @@ def _of_open3d(cloud: Any) -> Any:
     return None
 
 
-def _of_torch(tensor: Any) -> Any:
-    tensor = tensor.detach().cpu()
-    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
-
-
 _READERS = {
     "open3d": _of_open3d,
     "pyvista": lambda dataset: getattr(dataset, "points", None),
     "trimesh": lambda geometry: getattr(geometry, "vertices", None),
     "laspy": lambda las: getattr(las, "xyz", None),
-    "torch": lambda tensor: _of_torch(tensor) if hasattr(tensor, "detach") else None,
+    "torch": dense_tensor,
 }
 """Root module of a cloud's type -> what finds its points, None where it has none."""
 

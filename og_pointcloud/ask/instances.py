@@ -7,11 +7,12 @@ it is first asked, so that a table costs nothing until then.
 from __future__ import annotations
 
 import json
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Integral
-from typing import Any, overload
+from typing import Any, SupportsIndex, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,19 +138,20 @@ class Instances(Sequence[Instance]):
         return len(self._rows)
 
     @overload
-    def __getitem__(self, index: int) -> Instance: ...
+    def __getitem__(self, index: SupportsIndex) -> Instance: ...
     @overload
     def __getitem__(self, index: slice) -> Instances: ...
-    def __getitem__(self, index: int | slice) -> Instance | Instances:
+    def __getitem__(self, index: SupportsIndex | slice) -> Instance | Instances:
         """The instance with this id, or a table of several. IndexError for an id that is no instance's."""
         if isinstance(index, slice):
             return Instances(self._rows[index])
-        if not 0 <= index < len(self):
+        row = operator.index(index)
+        if not 0 <= row < len(self):
             raise IndexError(
                 f"{index} is no instance id of {len(self)}; expected 0 to {len(self) - 1}: -1 is background, "
                 "-2 unobserved, -3 too far from the scene"
             )
-        return self._rows[index]
+        return self._rows[row]
 
     def largest(self, count: int | None = None) -> Instances:
         """By falling number of points, of equals the smaller id first; only the first ``count``, 0 or more."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.choosing import Chooser, Reason
-from og_pointcloud.ask.hosts import carried_scene, import_plugin, numbers_of, world_points
+from og_pointcloud.ask.hosts import carried_scene, import_plugin, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
@@ -30,7 +30,17 @@ from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError, counted, span
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.scene import RIGID, DoubleArray, FloatArray, IntArray, float32_step, rotation_error
+from og_pointcloud.scene import (
+    RIGID,
+    DoubleArray,
+    FloatArray,
+    IntArray,
+    float32_step,
+    numbers_of,
+    pose_matrix,
+    rotation_error,
+    rounded_pose,
+)
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | StrPath"
@@ -53,6 +63,7 @@ class LabelledScene:
     manifest: the file's, with counts, parity figures, provenance; None and empty for a scene in memory.
     instance_ids: (n,) int32, row of ``instances``, -1 background, -2 unobserved. vocabulary: the words that may be
     asked as strings, None without any. feature_space: name of the encoder that label vectors must come from.
+    Its own arrays are read-only, as every later answer is made of them: Open3D's Vector3dVector wants `xyz.copy()`.
 
     >>> scene = og.LabelledScene.from_cloud(cloud)  # of `LabelledCloud`'s example; og.load reads a file
     >>> scene.instances_at(np.array([[0.02, 0, 1], [1, 0.1, 1], [9, 9, 9]]))
@@ -64,7 +75,7 @@ class LabelledScene:
     def __init__(self, bundle: Bundle) -> None:
         self._bundle, cloud = bundle, bundle.cloud
         self.cloud, self.path, self.manifest = cloud, bundle.path, bundle.manifest
-        self.instance_ids = cloud.instance_ids
+        self.instance_ids = _read_only(cloud.instance_ids.view())  # the cloud's own array may be a caller's
         self.vocabulary, self.feature_space = cloud.vocabulary, cloud.feature_space
 
     def __repr__(self) -> str:
@@ -88,13 +99,13 @@ class LabelledScene:
     @cached_property
     def xyz(self) -> DoubleArray:
         """(n, 3) float64, world coordinates."""
-        return self.cloud.xyz_world
+        return _read_only(self.cloud.xyz_world)
 
     @cached_property
     def certainty(self) -> FloatArray | None:
         """(n,) float32 in [0, 1], as ``LabelledCloud.certainty``; None where that is not known."""
         stored = self.cloud.certainty
-        return None if stored is None else (stored / 255).astype(np.float32)
+        return None if stored is None else _read_only((stored / 255).astype(np.float32))
 
     @cached_property
     def instances(self) -> Instances:
@@ -139,7 +150,10 @@ class LabelledScene:
         Exact: of points equally near the first one counts, and a point of the scene finds its own id.
         """
         self.check_distance(max_distance)
-        local = self._local(points)
+        return self._instances_at(self._local(points), max_distance)
+
+    def _instances_at(self, local: FloatArray, max_distance: float | None) -> IntArray:
+        """The same of points (N, 3) in the cloud's frame."""
         instances = np.empty(len(local), np.int32)
         for start in range(0, len(local), POINTS_PER_RUN):
             run = slice(start, start + POINTS_PER_RUN)
@@ -162,10 +176,13 @@ class LabelledScene:
     def certainty_at(self, points: NDArray[np.floating]) -> FloatArray | None:
         """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
         the scene does not know it. points: (N, 3), world coordinates. An exact search of every point."""
-        if self.certainty is None or points is self.xyz:
-            return self.certainty
+        return self.certainty if points is self.xyz else self._certainty_at(self._local(points))
+
+    def _certainty_at(self, local: FloatArray) -> FloatArray | None:
+        """The same of points (N, 3) in the cloud's frame."""
+        if self.certainty is None:
+            return None
         of_points = np.append(self.certainty, np.float32(0))
-        local = self._local(points)
         certainty = np.zeros(len(local), np.float32)
         finite = np.isfinite(local).all(axis=1)
         certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the added 0
@@ -303,17 +320,23 @@ class Segmenter:
     def _answer(self, pcd: Any, pose: ArrayLike | None) -> Segmentation:
         scene = self.scene
         own = as_scene(pcd) if _is_scene(pcd) else None
-        if own is not None and own.cloud is scene.cloud and pose is None:  # its own points need no look-up
-            points, instances = scene.xyz, scene.instance_ids
+        are_own = own is not None and own.cloud is scene.cloud and pose is None
+        if are_own:  # they need no look-up
+            points, instances = scene.xyz.copy(), scene.instance_ids.copy()
+            certainty_of = partial(scene.certainty_at, scene.xyz)
         else:
-            points = _posed(world_points(pcd) if own is None else own.xyz, pose)
-            instances = scene.instances_at(points, max_distance=self._max_distance)
+            points = _posed(world_points(pcd) if own is None else own.xyz.copy(), pose)
+            local = scene._local(points)  # it stays what was asked about, whatever becomes of the result's points
+            instances = scene._instances_at(local, self._max_distance)
+            if self._max_distance is not None:
+                local[instances == TOO_FAR] = np.inf  # certainty has no shorter reach than the scene's
+            certainty_of = partial(scene._certainty_at, local)
         labels, scores, reasons = self._choice.at(instances)
         result = Segmentation(
             points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
-            scene.certainty_at,
+            certainty_of,
         )  # fmt: skip
-        if not self._warned and (reason := _why_few(result, scene)):
+        if not self._warned and (reason := _why_few(result, scene, are_own, pose)):
             self._warned = True
             warnings.warn(reason, stacklevel=3)  # where segment, or the segmenter, is called
         return result
@@ -385,20 +408,6 @@ def _scene_once(cloud: LabelledCloud) -> LabelledScene:
     return LabelledScene.from_cloud(cloud)
 
 
-def pose_matrix(pose: ArrayLike) -> DoubleArray:
-    """A pose (4, 4) as float64. SceneError for numbers that are not finite and a last row other than 0 0 0 1."""
-    matrix = numbers_of(pose)
-    if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
-        seen = f"{matrix.dtype} {matrix.shape}, {matrix.tolist()!s:.60}"
-        raise SceneError(f"pose is {seen}; expected a finite 4x4 matrix, cloud to world")
-    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise SceneError(
-            f"the last row of pose is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is the "
-            "translation (transposed, perhaps?)"
-        )
-    return matrix.astype(np.float64)
-
-
 def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
     if pose is None:
         return points
@@ -413,13 +422,14 @@ def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
-    """Why no point has a label, or that many lie elsewhere than the scene; None where neither is so."""
+def _why_few(result: Segmentation, scene: LabelledScene, are_own: bool, pose: ArrayLike | None) -> str | None:
+    """Why no point has a label, or that many lie elsewhere than the scene; None where neither is so. are_own: whether
+    they are the scene's own points."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
     finite = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     far = int((finite & (result.reasons == Reason.TOO_FAR)).sum())
-    cause = "" if result.xyz is scene.xyz else _misplaced(result.xyz[finite], far, scene)
+    cause = "" if are_own else _misplaced(result.xyz[finite], far, scene, pose)
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
@@ -427,9 +437,9 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
     return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
-def _misplaced(points: DoubleArray, far: int, scene: LabelledScene) -> str:
+def _misplaced(points: DoubleArray, far: int, scene: LabelledScene, pose: ArrayLike | None) -> str:
     """Why points, all finite, may not lie where the scene has them, "" if nothing says so. far: how many are too far
-    from it."""
+    from it. pose: what brought them there."""
     if len(scene.cloud) == 0:
         return ""
     some = points[:: 1 + len(points) // LOOKED_AT]
@@ -439,6 +449,8 @@ def _misplaced(points: DoubleArray, far: int, scene: LabelledScene) -> str:
             f"float32 rounded them to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give them as "
             "float64, or take an offset off before they become float32, and give it in pose="
         )
+    if pose is not None and (coarse := rounded_pose(pose, spacing)):
+        return coarse
     if far > ELSEWHERE_SHARE * len(points):
         return (
             f"the points span {span(points)}, the scene {span(scene.xyz)}, its reach is {reach:.4g}: bring them into "
@@ -450,6 +462,11 @@ def _misplaced(points: DoubleArray, far: int, scene: LabelledScene) -> str:
             "points: bring them into the scene's unit"
         )
     return ""
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    array.flags.writeable = False
+    return array
 
 
 def _width(points: NDArray[np.floating]) -> float:

@@ -11,6 +11,7 @@ Views of a capture map from its local frame: ``in_world(view.camera, capture.poi
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import overload
@@ -18,13 +19,12 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, numbers_of, rounded_pose
 from og_pointcloud.text.words import Labels, TextFeatures
 
 NEAR = 1.0
@@ -127,7 +127,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
         at +0.5); or a place, (3,) world coordinates: the nearest point counts, if within the scene's reach.
 
     A miss is a Pick too: its ``instance`` says which kind, ``str(pick)`` in words. Raises OgPointcloudError for a pixel
-    outside the image and for numbers that are not finite.
+    outside the image and for numbers that are not finite. Warns of a camera whose pose float32 rounded.
 
     >>> camera = og.Camera(64, 48, 40.0, 40.0, 32.0, 24.0, np.eye(4))  # at the world's origin, along z
     >>> hit = og.pick(cloud, camera, (32, 24))  # of `LabelledCloud`'s example
@@ -136,6 +136,8 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     """
     scene = as_scene(scene)
     if isinstance(where, Camera):
+        if coarse := rounded_pose(where.world_to_camera, scene.cloud.spacing):
+            warnings.warn(f"another point may be hit; {coarse}", stacklevel=2)
         point = _point_at_pixel(scene.cloud, where, uv_px)
     elif uv_px is not None:
         raise OgPointcloudError(f"uv_px is given with a {type(where).__name__}; expected it with a Camera alone")
@@ -146,7 +148,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     return Pick(scene, int(scene.instance_ids[point]), point, scene.cloud.xyz[point] + scene.cloud.origin)
 
 
-def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
+def in_world(camera: Camera, origin: ArrayLike) -> Camera:
     """A camera of a scene's local frame as one of world coordinates. origin: (3,), world = local + origin.
 
     >>> import numpy as np

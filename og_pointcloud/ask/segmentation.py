@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.hosts import import_plugin
-from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.colors import label_colors
@@ -37,7 +37,9 @@ class Segmentation:
     names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS.
-    certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
+    certainty_of: what ``certainty`` reads: (N,) float32, or a function that looks it up; None if it is not known.
+
+    All arrays are the result's own: changing them changes no scene.
 
     >>> result = og.segment([[0, 0, 1], [9, 9, 9]], ["chair"], cloud)  # of `LabelledCloud`'s example
     >>> result.mask("chair"), result.instances
@@ -54,12 +56,16 @@ class Segmentation:
     names: tuple[str, ...]
     scene: Path | None = None
     calibrated: bool = False
-    certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
-        default=lambda points: None, repr=False
+    certainty_of: Callable[[], NDArray[np.float32] | None] | NDArray[np.float32] | None = field(
+        default=None, repr=False
     )
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """With its certainty, in place of the scene that would be asked for it."""
+        return {**vars(self), "certainty_of": self.certainty}
 
     def __repr__(self) -> str:
         """How many points have each label, the most frequent first, and why the others have none; and whether labels
@@ -78,14 +84,21 @@ class Segmentation:
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:
         """(N,) float32 in [0, 1]: how far views and neighbors bear out that a point is in its instance, or in none, as
-        the scene's nearest point has it; 0 where no view saw it or the scene is too far.
+        the scene's nearest point has it; 0 where no view saw it or the scene is too far. Looked up when it is first
+        read, for the points that were asked about.
 
         ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
         borders, and where masks disagree. None where the scene does not know it.
         """
-        certainty = self.certainty_at(self.xyz)
-        # A shorter reach may have been asked for than the one that certainty is looked up by.
-        return None if certainty is None else np.where(self.instances == TOO_FAR, np.float32(0), certainty)
+        certainty = self.certainty_of() if callable(self.certainty_of) else self.certainty_of
+        if certainty is None:
+            return None
+        if len(certainty) != len(self):  # rows were chosen by dataclasses.replace
+            raise OgPointcloudError(
+                f"certainty is of {len(certainty):,} points, the result has {len(self):,}; expected one a point: give "
+                "the rows' as certainty_of"
+            )
+        return certainty.copy()  # it may be the scene's
 
     def mask(self, name: str) -> NDArray[np.bool_]:
         """(N,) bool, the points with this label."""
@@ -147,6 +160,10 @@ class Segmentation:
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
         room for NaN, .glb none for an empty cloud.
         """
+        if not isinstance(path, (str, os.PathLike)):
+            raise OgPointcloudError(
+                f"the file to save is {path!r:.80}; expected a name, with one of {', '.join(SAVED_AS)}"
+            )
         path, columns = Path(path), (self.xyz, self.colors, self.attributes, self.names)
         if path.suffix not in SAVED_AS:
             raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")

@@ -50,11 +50,11 @@ def read_bundle(path: StrPath) -> Bundle:
     >>> bundle.cloud.feature_space, bundle.manifest["counts"]["points"]
     ('two-words', 3)
     """
-    path = Path(path)
-    if not os.path.isfile(path):
+    if not isinstance(path, (str, os.PathLike)) or not os.path.isfile(path):
         raise BundleError(
             f"{path} is not a file; expected a .ogpc file: check the name, or make it (og-pointcloud fit)"
         )
+    path = Path(path)
     try:
         with path.open("rb") as file:
             members, carried = _members(file)
@@ -169,6 +169,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     if not np.isfinite(xyz).all():
         raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
     ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGERS, (points,)).astype(np.int32)
+    ids.flags.writeable = False  # as all other arrays of a file are
     rgb = _array(members, ogpc.RGB, ("|u1",), (points, 3)) if ogpc.RGB in members else None
     certainty = _array(members, ogpc.CERTAINTY, ("|u1",), (points,)) if ogpc.CERTAINTY in members else None
     cameras = _array(members, ogpc.CAMERAS, ("<f8",), (None, 18)) if ogpc.CAMERAS in members else np.zeros((0, 18))

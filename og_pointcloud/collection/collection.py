@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import fnmatch
 import json
-import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
@@ -16,16 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.bundle.vocabulary import carried_encoder
-from og_pointcloud.cloud import Vocabulary, unit_rows
+from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, Vocabulary, unit_rows
 from og_pointcloud.collection.index import Changes, Family, Group, families, index
 from og_pointcloud.collection.lance import FEW_SCENES, LanceTables
 from og_pointcloud.collection.scoring import Block, load_block, share
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError, counted, did_you_mean
 from og_pointcloud.formats.atomic import StrPath
+from og_pointcloud.scene import numbers_of
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
-from og_pointcloud.text.text_features import read_text_features
-from og_pointcloud.text.words import TextFeatures
+from og_pointcloud.text.words import TextFeatures, resolve_labels, words_of
 
 TOP = 20
 """Findings that are answered unless told otherwise."""
@@ -148,7 +147,7 @@ class Collection:
 
     def find(
         self,
-        words: str | Iterable[str],
+        words: str | Iterable[str] | Mapping[str, ArrayLike],
         *,
         within: tuple[ArrayLike, ArrayLike] | None = None,
         scenes: str | Iterable[str] | None = None,
@@ -158,23 +157,32 @@ class Collection:
         """The instances that words fit best, of all scenes.
 
         words: looked up in text_features, then among the words of a scene's family (scenes of one encoder), else
-        encoded, if there is an encoder. A scene that cannot be asked for a word is left out, and ``not_asked`` says so.
+        encoded, if there is an encoder; or name -> vector (D,), which scenes of that width are asked. A scene that
+        cannot be asked for a word is left out, and ``not_asked`` says so.
         within: two corners (3,); only instances whose box has its center between them, in their scene's world.
         scenes: names, or patterns such as "site3/*". top: how many.
-        Raises OgPointcloudError where no scene can be asked, or a name or pattern fits none.
+        Raises OgPointcloudError where no scene can be asked, or a name or pattern fits none; FeatureSpaceError where
+        vectors fit none.
         """
         if not isinstance(top, Integral) or top < 1:
             raise OgPointcloudError(f"top is {top!r:.40}; expected a whole number, at least 1")
         names = tuple(dict.fromkeys(words if isinstance(words, Iterable) and not isinstance(words, str) else (words,)))
         if not names or not all(isinstance(name, str) and name.strip() for name in names):
             raise OgPointcloudError(f"the words are {names!r:.80}; expected at least one word or phrase")
-        features = read_text_features(text_features) if isinstance(text_features, (str, os.PathLike)) else text_features
+        features = None if text_features is None else words_of(text_features)
+        given = None
+        if isinstance(words, Mapping):
+            arrays = {name: numbers_of(vector) for name, vector in words.items()}
+            given = resolve_labels(arrays, None, None, UNKNOWN_SPACE)
         box = None if within is None else _corners(within)
         self._open()
         wanted = _Wanted(self._ids(scenes), box, top)
         asked = [group for group in self._groups if wanted.among(group)]
-        vectors = [self._vectors(group.family, names, features) for group in asked]
+        vectors = [self._vectors(group.family, names, features, given) for group in asked]
         if not any(vectors):
+            if given is not None and asked:
+                space = FeatureSpace(asked[0].family.feature_space, asked[0].family.width)
+                space.require(FeatureSpace(UNKNOWN_SPACE, given.vectors.shape[1]), "label vectors")
             raise _unanswerable(names[0], [group.family for group in asked])
         # The best of each group and word, then the best of all: (what it is ranked by, finding).
         ranked = [
@@ -214,9 +222,16 @@ class Collection:
         return ids
 
     def _vectors(
-        self, family: Family, names: Iterable[str], features: tuple[Vocabulary, str] | None
+        self,
+        family: Family,
+        names: Iterable[str],
+        features: tuple[Vocabulary, str] | None,
+        given: Vocabulary | None,
     ) -> dict[str, NDArray[np.float32]]:
-        """Unit vectors of those words that these scenes can be asked for."""
+        """Unit vectors of those words that these scenes can be asked for. given: by vectors, these alone."""
+        if given is not None:
+            fits = given.vectors.shape[1] == family.width
+            return dict(zip(given.names, unit_rows(given.vectors), strict=True)) if fits else {}
         known = family.words
         if features is not None and (features[1], features[0].vectors.shape[1]) == (family.feature_space, family.width):
             known = known | dict(zip(features[0].names, unit_rows(features[0].vectors), strict=True))

@@ -48,13 +48,14 @@ def read_points(path: StrPath) -> Points:
 
 def read_places(path: StrPath) -> NDArray[np.float64]:
     """(n, 3) float64 world coordinates of every row of such a file, to be labelled: rows with NaN or infinity stay, and
-    a warning says that they stay unknown."""
+    a warning says that they stay unknown. A PLY or PCD may have no rows, as an array may."""
     path = Path(path)
     with naming(path):
         found = _read(path)
         if isinstance(found, Points):
             return found.xyz_world
-        _placed(path, positions(found), "unknown")
+        if len(found):
+            _placed(path, positions(found), "unknown")
         return positions(found)
 
 

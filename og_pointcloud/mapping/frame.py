@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.hosts import numbers_of, world_points
+from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
 from og_pointcloud.formats.depth import lengths
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
-from og_pointcloud.scene import Camera, View
+from og_pointcloud.scene import Camera, View, numbers_of
 
 COMPARED = 4000
 """About how many points of the map a frame's depth is compared with."""
@@ -55,7 +55,7 @@ class Frame:
     camera: Camera | None
     masks: NDArray[np.integer] | None = None
     features: NDArray[np.floating] | None = None
-    depth: NDArray[np.floating] | None = None
+    depth: NDArray[np.floating | np.integer] | None = None
     cloud: Any = None
     rgb: NDArray[np.uint8] | None = None
     stamp: float | None = None

@@ -14,7 +14,6 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthImage
@@ -30,7 +29,7 @@ from og_pointcloud.rendering.geometry import depths, isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
 from og_pointcloud.rendering.surface import sight_thickness
-from og_pointcloud.scene import Camera, Points
+from og_pointcloud.scene import Camera, Points, numbers_of
 from og_pointcloud.settings import GeometrySettings
 
 MARGIN = 0.1

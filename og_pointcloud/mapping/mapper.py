@@ -38,7 +38,7 @@ from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
-from og_pointcloud.scene import Points, require_finite
+from og_pointcloud.scene import Points, require_finite, rounded_pose
 from og_pointcloud.settings import FitSettings, fit_settings
 
 PIXELS_PER_SPACING = 4.0
@@ -275,7 +275,7 @@ class Mapper:
             self._journal.settle(self._map)
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
-        """The frame, and the map that it goes into: an empty one where there is none yet."""
+        """The frame, and the map that it goes into: an empty one where there is none yet. Warns of a rounded pose."""
         known = self._map
         if known is not None:
             given = checked(frame, known.origin, known.space, known.stamp + 1)
@@ -291,6 +291,8 @@ class Mapper:
             pixel = given.view.pixel * given.view.camera.fx / given.camera.fx
             spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, given.view.pixel)
             known = GrowingMap.empty(origin, self._space, spacing)
+        if frame.camera is not None and (coarse := rounded_pose(frame.camera.world_to_camera, known.points.edge)):
+            warnings.warn(f"frames may be placed wrongly; {coarse}", stacklevel=3)
         return given, known
 
     def _label(self, known: GrowingMap) -> LabelledCloud:

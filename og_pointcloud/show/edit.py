@@ -19,13 +19,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, SupportsIndex, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.hosts import numbers_of
-from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene, pose_matrix
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
@@ -37,14 +36,14 @@ from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.formats.tables import naming, positions
-from og_pointcloud.scene import DoubleArray, IntArray
+from og_pointcloud.scene import DoubleArray, IntArray, numbers_of, pose_matrix
 from og_pointcloud.show.splat_columns import appended, placed, recolored
 from og_pointcloud.text.words import TextFeatures
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-What: TypeAlias = "str | int | Iterable[int] | Pick | Match | Selection"
+What: TypeAlias = "str | SupportsIndex | Iterable[SupportsIndex] | Pick | Match | Selection"
 """What to edit: a text, for the instances that it fits (`select`); ids of instances; what a click or `select` gave."""
 
 Rows = NDArray[np.void]
@@ -108,6 +107,8 @@ def recolor(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **o
     rgb = numbers_of(color)
     if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
+    if (rgb % 1).any() or (rgb.dtype.kind == "f" and 0 < rgb.max() <= 1):  # 1.0 is nearly black, or full
+        raise OgPointcloudError(f"color is {color}; expected whole numbers: scale to 0..255")
     subject = _subject(scene, what, output, **options)
     return subject.write(output, recolored(subject.rows, subject.chosen, rgb / 255), "recolored")
 
@@ -194,6 +195,12 @@ def _subject(
 
 def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatures) -> tuple[int, ...]:
     count = len(scene.cloud.instances)
+    of = what.scene if isinstance(what, (Pick, Selection)) else what._scene if isinstance(what, Match) else scene
+    if not _is_same(of, scene):
+        raise OgPointcloudError(
+            f"the {type(what).__name__} to edit is of {of!r:.80}, the scene is {scene!r:.80}; expected one of this "
+            "scene: they are of two scenes"
+        )
     # Step by step from what is meant to ids: a text becomes a selection, that its instances, a single one its id.
     if isinstance(what, str):
         what = select(scene, what, text_features=text_features)
@@ -213,6 +220,13 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
             "have missed"
         )
     return tuple(int(k) for k in dict.fromkeys(ids))
+
+
+def _is_same(one: LabelledScene, other: LabelledScene) -> bool:
+    """Whether ids of one mean the same points in the other: a file may be opened twice, or sent to a process."""
+    return one is other or (
+        np.array_equal(one.cloud.xyz, other.cloud.xyz) and np.array_equal(one.instance_ids, other.instance_ids)
+    )
 
 
 def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None) -> tuple[IntArray, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -53,6 +54,8 @@ def resolve_labels(
         return _checked(labels.names, labels.vectors) if labels.names else labels
     if isinstance(labels, Mapping):
         return _checked([str(name) for name in labels], _stacked(labels, labels.values()))
+    if isinstance(labels, np.ndarray):
+        labels = [*np.atleast_1d(labels)]  # one without dimensions is a word
     if isinstance(labels, (set, frozenset)):  # the order of a set is another one in the next run
         labels = sorted(labels, key=str)
     words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
@@ -81,12 +84,22 @@ def _ways(feature_space: str) -> str:
 def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | None:
     if text_features is None:
         return None
-    if isinstance(text_features, tuple):
-        source, (vocabulary, space) = "text_features", text_features
-    else:
-        source, (vocabulary, space) = str(Path(text_features)), read_text_features(text_features)
+    vocabulary, space = words_of(text_features)
+    source = "text_features" if isinstance(text_features, tuple) else str(Path(text_features))
     FeatureSpace(feature_space, 0).require(FeatureSpace(space, vocabulary.vectors.shape[1]), f"names of {source}")
     return vocabulary
+
+
+def words_of(text_features: StrPath | tuple[Vocabulary, str]) -> tuple[Vocabulary, str]:
+    """What `read_text_features` returns for a file, or has returned. OgPointcloudError for anything else."""
+    if isinstance(text_features, (str, os.PathLike)):
+        return read_text_features(text_features)
+    if isinstance(text_features, tuple) and [*map(type, text_features)] == [Vocabulary, str]:
+        return text_features
+    raise OgPointcloudError(
+        f"text_features are a {type(text_features).__name__}; expected an .npz file, or what og.read_text_features "
+        "returned for one, (Vocabulary, name of the feature space): give {name: vector} as labels"
+    )
 
 
 def _stacked(names: Iterable[str], vectors: Iterable[Any]) -> NDArray[Any]:

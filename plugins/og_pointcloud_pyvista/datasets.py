@@ -31,8 +31,8 @@ BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a 
 
 
 def to_pyvista(result: Segmentation) -> pv.PolyData:
-    """A segmentation as a cloud of vertices in world coordinates, float64, with the arrays named above."""
-    mesh = pv.PolyData(result.xyz) if len(result) else pv.PolyData()
+    """A segmentation as a cloud of vertices in world coordinates, float64, with the arrays named above. All copied."""
+    mesh = pv.PolyData(result.xyz.copy()) if len(result) else pv.PolyData()
     _attach(mesh, result)
     return mesh
 
@@ -152,7 +152,7 @@ def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
 def _attach(mesh: Any, result: Segmentation) -> None:
     if len(result):  # PyVista refuses empty arrays
         for name, values in {**result.attributes, COLOR: result.colors}.items():
-            mesh.point_data[name] = values
+            mesh.point_data.set_array(values, name, deep_copy=True)  # or edits of the mesh would change the result
         mesh.set_active_scalars(LABEL, preference="point")
     set_strings(mesh, NAMES_FIELD, result.names)
     if result.scene is not None:

@@ -19,11 +19,12 @@ def read_ogpc(path: str) -> pv.PolyData:
     file, also where PyVista would say that it cannot read it.
     """
     scene = as_scene(path)
-    mesh = pv.PolyData(scene.xyz) if len(scene.xyz) else pv.PolyData()
+    # All copied: VTK writes into arrays that it is given, read-only or not, and the scene is kept for later answers.
+    mesh = pv.PolyData(scene.xyz.copy()) if len(scene.xyz) else pv.PolyData()
     if len(scene.xyz):
         if scene.cloud.rgb is not None:
-            mesh.point_data[RGB] = scene.cloud.rgb
-        mesh.point_data[INSTANCE] = scene.instance_ids
+            mesh.point_data.set_array(scene.cloud.rgb, RGB, deep_copy=True)
+        mesh.point_data.set_array(scene.instance_ids, INSTANCE, deep_copy=True)
         mesh.set_active_scalars(INSTANCE, preference="point")
     set_strings(mesh, SCENE_FIELD, [scene_name(path)])
     return mesh
