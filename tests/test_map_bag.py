@@ -70,6 +70,16 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys):
     assert "8 frames" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_a_folder_of_other_files_is_no_map_and_stays(tmp_path, capsys, more):
+    bag, work = write_bag(tmp_path / "drive", frames(THINGS)[:2]), tmp_path / "precious"
+    work.mkdir()
+    (work / "thesis.txt").write_text("keep")
+    assert main(["map", str(bag), "-o", str(tmp_path / "room.ogpc"), "--work", str(work), *more]) == 2
+    assert "holds other files than a map" in capsys.readouterr().err
+    assert (work / "thesis.txt").read_text() == "keep"
+
+
 def test_a_late_frame_is_resumed_too(tmp_path, capsys):
     given = frames(THINGS)[:4]
     given = [given[0], given[3], given[1], given[2]]  # as a bag holds them that was put together of two

@@ -30,9 +30,12 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud_ros.map_bags import BagFrames
     from tqdm import tqdm
 
+    from og_pointcloud.mapping.map_journal import holds_map
     from og_pointcloud.mapping.mapper import Mapper
 
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.map")
+    if work.exists() and not holds_map(work):  # it is removed in the end
+        raise OgPointcloudError(f"--work is '{work}', which holds other files than a map; expected a new folder's name")
     if work.exists() and not arguments.resume:
         raise OgPointcloudError(f"'{work}' holds a map that was interrupted: add --resume, or remove it")
     frames = BagFrames(arguments.bag, arguments.frame)

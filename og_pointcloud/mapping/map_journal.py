@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import locked, replacing
+from og_pointcloud.formats.atomic import LOCK, locked, replacing
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.frame import Frame, in_arrays
@@ -52,6 +52,7 @@ KINDS = {
 HEAD = struct.Struct("<4sQI")
 """Of a record: MAGIC, bytes that follow, and their CRC-32."""
 MAGIC = b"OGF3"
+LOG, STATE = "frames.log", "map.state"
 LOG_BYTES = 1 << 27
 """Bytes of changes after which the whole map is written and the log begins anew."""
 
@@ -64,6 +65,12 @@ _OPEN: WeakValueDictionary[Path, MapJournal] = WeakValueDictionary()
 """The journals of this process."""
 
 
+def holds_map(folder: Path) -> bool:
+    """Whether a path is a folder with nothing in it but what a journal, also one that was killed, leaves."""
+    ours = LOG, STATE, f".{LOG}", f".{STATE}", LOCK  # with a dot: being written
+    return folder.is_dir() and all(file.name.startswith(ours) for file in folder.iterdir())
+
+
 class MapJournal:
     """The folder of one map. OgPointcloudError where it cannot be written, holds the map of something else, or is
     another process's; within one process, whoever opened it last has it.
@@ -73,7 +80,7 @@ class MapJournal:
 
     def __init__(self, folder: str | os.PathLike[str], origin: str) -> None:
         self.folder = Path(folder)
-        self._log, self._state, self._origin = self.folder / "frames.log", self.folder / "map.state", origin
+        self._log, self._state, self._origin = self.folder / LOG, self.folder / STATE, origin
         self._file: io.FileIO | None = None
         if earlier := _OPEN.pop(self.folder.resolve(), None):
             earlier._lock.close()
