@@ -52,7 +52,7 @@ class LeftOut(Enum):
     )
     SPANNING_MASKS = (
         "spanning masks", "{count} masks",
-        "most views show each of them as several things; all that they tell is that a point is of one of these",
+        "each of them holds several things: they tell points only that they are of one of these",
     )
     CONTRADICTED_GROUPS = (
         "contradicted groups", "{count} of {total} groups of masks",

@@ -449,6 +449,7 @@ def _heard(start, state, evidence, likely, neighbors, weights, openly, loudness)
                 for c in range(begin, end):
                     if state[c] == state[o]:
                         value[c - begin] += voice * likely[o]
+                        break
         value = np.exp(value - value.max())
         heard[begin:end] = value / value.sum()
     return heard

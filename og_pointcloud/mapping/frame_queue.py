@@ -68,8 +68,8 @@ class FrameQueue:
                 change = self.mapper.integrate(frame)
                 self._on_change(change)
         except Exception as error:  # the thread lives on, and the next frame goes in
-            why = f"failed: {type(error).__name__}: {error}"
-            if change is not None:
-                self._on_drop(f"a frame went in, but on_change {why}")
+            if change is None and isinstance(error, OgPointcloudError):
+                self._on_drop(f"a frame was refused: {error}")
             else:
-                self._on_drop(f"a frame {f'was refused: {error}' if isinstance(error, OgPointcloudError) else why}")
+                what = "a frame failed" if change is None else "a frame went in, but on_change failed"
+                self._on_drop(f"{what}: {type(error).__name__}: {error}")
