@@ -12,7 +12,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
@@ -227,6 +227,44 @@ def test_processes_end_with_the_one_that_started_them():
     except subprocess.TimeoutExpired:
         os.kill(worker, signal.SIGKILL)
         raise
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C reaches no process group there")
+@pytest.mark.parametrize("busy", [False, True])
+def test_ctrl_c_is_told_once_and_not_by_each_process(busy):
+    """Neither while they start, nor in a task, nor by those that wait for one."""
+    wait = "[workers.submit(abs, -1).result(), time.sleep(0.3)]" if busy else "None"
+    code = (
+        "import time\nfrom og_pointcloud.fitting.tasks import LocalWorkers\nif __name__ == '__main__':\n"
+        f"    workers = LocalWorkers(2)\n    {wait}\n    workers.submit(time.sleep, 60)\n"
+        "    print('started', flush=True)\n"
+        "    try:\n        time.sleep(60)\n    except KeyboardInterrupt:\n        print('interrupted')\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        started.stdout.readline()
+        time.sleep(1.0 if busy else 0.05)
+        os.killpg(started.pid, signal.SIGINT)
+        out, err = started.communicate(timeout=60)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(started.pid, signal.SIGKILL)
+    assert (out, err) == ("interrupted\n", "")
+
+
+def test_warnings_come_with_the_capture_they_are_of(captures, one_by_one, tmp_path):
+    odd = write_tiny_capture(tmp_path / "odd").folder
+    [geometry] = odd.glob("*.ply")
+    plain = og.read_points(geometry)
+    vertices = np.vstack([plain.xyz, [[np.nan] * 3]]).astype("<f4")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+    columns = "".join(f"property float {axis}\n" for axis in "xyz")
+    geometry.write_bytes(f"{header}{columns}end_header\n".encode() + vertices.tobytes())
+    with pytest.warns(UserWarning, match=r"^odd: .*1 of 1577 points hold NaN or infinity") as told:
+        (fit,) = og.fit_many(odd, tmp_path / "out", Inline(), progress=False)
+    assert [f"odd: {text}" for text in fit.warnings] == [str(warning.message) for warning in told]
 
 
 def test_shares():

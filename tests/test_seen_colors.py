@@ -18,6 +18,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.colors import DIFFERENCES, MOST, likelihood_ratios
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, doubted_by_color, sight_ratios
+from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Camera, Points, View
 
 SIDE, NEAR = 20, 0.1
@@ -137,11 +138,13 @@ def unreadable() -> NDArray[np.uint8]:
 
 
 def test_a_view_without_a_photograph_counts_as_if_colors_said_nothing() -> None:
-    found = []
-    for image in (None, unreadable):
+    found, journals = [], [Journal(False), Journal(False)]
+    for image, journal in zip((None, unreadable), journals, strict=True):
         points, views, table = street(np.random.default_rng(0))
-        found.append(doubted_by_color(table, points, [*views[:2], replace(views[2], image=image)], NEAR))
+        found.append(doubted_by_color(table, points, [*views[:2], replace(views[2], image=image)], NEAR, journal))
     without, broken = found
+    told = "photographs of 1 of 3 views cannot be read: c.jpg cannot be decoded"
+    assert [journal.warnings for journal in journals] == [[], [told]]
     np.testing.assert_array_equal(without.exposure.toarray(), broken.exposure.toarray())
     np.testing.assert_allclose(without.exposure[[2]].data, 0.5)
     assert without.exposure[[0]].data.max() > 0.8 > 0.2 > without.exposure[[0]].data.min()

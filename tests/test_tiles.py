@@ -187,6 +187,18 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
     assert (cloud.instance_ids[1600:] < 0).all()
 
 
+@pytest.mark.parametrize("most", [None, 1600])
+def test_photographs_that_cannot_be_read_are_counted(most):
+    """All of them: the checks before a fit ask for some."""
+    scene, grey = two_walls(), np.full((60, 60, 3), 99, np.uint8)
+    images = (grey, grey[1:], grey.astype(float))
+    views = tuple(replace(view, image=image) for view, image in zip(scene.views, images, strict=True))
+    colored = replace(scene.points, rgb=np.full((3200, 3), 99, np.uint8))
+    cloud = fit(replace(scene, points=colored, views=views), FitSettings(tile_points=most), progress=False)
+    [told] = [text for text in cloud.provenance["warnings"] if text.startswith("photographs")]
+    assert told.startswith("photographs of 2 of 3 views cannot be read: view 'view1': the image is uint8 (59, 60, 3)")
+
+
 def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     cloud = TiledCloud.cut(points, len(points), SETTINGS, work)
     work.array("spacing", cloud.key, lambda: np.full((2, len(points)), spacing, np.float32))

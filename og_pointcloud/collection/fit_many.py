@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from multiprocessing import current_process
 from pathlib import Path
@@ -16,7 +18,7 @@ from typing import Any, Literal
 from og_pointcloud.ask.hosts import import_plugin
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.bundle.vocabulary import scene_words
-from og_pointcloud.checking.check import check_words, with_checks
+from og_pointcloud.checking.check import CaptureWarning, check_words, with_checks
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import fit
@@ -52,7 +54,8 @@ class FitOptions:
 class CaptureFit:
     """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
     cause. worker: where, as host:process, or "lost". peak_bytes: the most memory that this process has held, 0 if
-    unknown. doubts: names of the checks that failed (the file's provenance says why).
+    unknown. doubts: names of the checks that failed (the file's provenance says why). warnings: what else was to be
+    told of it.
 
     >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
     'kitchen'
@@ -68,6 +71,7 @@ class CaptureFit:
     worker: str = ""
     peak_bytes: int = 0
     doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -90,7 +94,8 @@ def fit_many(
     A task takes its share of the worker's memory and cores; `FitSettings.memory` is the most for each.
 
     Files that are there and whole are left as they are; fits that were killed resume after the views that they kept.
-    Returns what became of each, in the order given; nothing is raised for a capture that fails. The files do not depend
+    Returns what became of each, in the order given; nothing is raised for a capture that fails. Warnings come with the
+    capture's name. The files do not depend
     on where and in what order they were made: they hold no times, which are in the returned records.
     OgPointcloudError, before any work, for two captures of one name, and in a script that calls it at its top level
     without an executor: its processes import the script, which would run once more in each.
@@ -132,7 +137,9 @@ def _fit_all(
         futures = {_submitted(workers, capture, todo[capture], options, share): capture for capture in pending}
         try:
             for future in with_bar(as_completed(futures), attempt, len(futures), progress and len(futures) > 0):
-                fits[futures[future]] = _outcome(future, futures[future], todo[futures[future]])
+                fits[futures[future]] = found = _outcome(future, futures[future], todo[futures[future]])
+                for text in found.warnings:
+                    warnings.warn(f"{found.name}: {text}", stacklevel=3)
         finally:
             for future in futures:  # on an interrupt, those that have not begun
                 future.cancel()
@@ -179,8 +186,10 @@ def _is_whole(path: Path) -> bool:
 def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> CaptureFit:
     """The task: never raises, as not every error survives the way back from another process."""
     start, worker = time.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
+    told: list[str] = []
     try:
-        cloud = _fit(Path(capture), Path(output), options, share_here(share))
+        with _recorded(told):
+            cloud = _fit(Path(capture), Path(output), options, share_here(share))
     except Exception as error:
         # Our own errors, the system's and missing extras say what is wrong; of any other the kind is told too.
         expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
@@ -191,7 +200,25 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
     else:
         doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
         result = CaptureFit(capture, output, "fitted", points=len(cloud), instances=len(cloud.instances), doubts=doubts)
-    return replace(result, seconds=round(time.perf_counter() - start, 3), worker=worker, peak_bytes=peak_memory())
+        told += cloud.provenance["warnings"]
+    seconds = round(time.perf_counter() - start, 3)
+    return replace(result, seconds=seconds, worker=worker, peak_bytes=peak_memory(), warnings=tuple(told))
+
+
+@contextmanager
+def _recorded(told: list[str]) -> Iterator[None]:
+    """Adds the warnings that a fit gives to ``told``, but for doubts, which its provenance has. Python cannot tell
+    apart those of several threads: in a thread they go where they always do."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("ignore")  # what libraries tell programmers
+        warnings.simplefilter("always", UserWarning)
+        try:
+            yield
+        finally:
+            told += [str(warning.message) for warning in found if not issubclass(warning.category, CaptureWarning)]
 
 
 def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:

@@ -225,7 +225,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
         table = front_surfaces(surface, table, settings, journal)
         if settings.mode == "paper":  # which draws views again, and asks for the masks of each
             return table
-        table = doubted_by_color(table, surface.scene.points, views, surface.near, progress=journal.progress)
+        table = doubted_by_color(table, surface.scene.points, views, surface.near, journal)
         return Photographs.of(views).joined(table)
 
 

@@ -27,7 +27,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.colors import DIFFERENCES, color_difference, likelihood_ratios
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
-from og_pointcloud.journal import with_bar
+from og_pointcloud.journal import Journal, with_bar
 from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import seen_from
 from og_pointcloud.scene import Points, View
@@ -42,24 +42,28 @@ Doubles = NDArray[np.float64]
 
 
 def doubted_by_color(
-    table: MaskTable, points: Points, views: Sequence[View], near: float, *, progress: bool = False
+    table: MaskTable, points: Points, views: Sequence[View], near: float, journal: Journal | None = None
 ) -> MaskTable:
     """The table with exposures that colors bear out. It takes the place of the given one, whose exposure is written
-    over. points, views: what it was made from. near: depth of the near plane, scene units. progress: show a bar."""
+    over. points, views: what it was made from. near: depth of the near plane, scene units. journal: of the fit, is told
+    of photographs that cannot be read."""
     if points.rgb is None or all(view.image is None for view in views):
         return table
+    journal = journal or Journal(progress=False)
     start, columns, exposure = table.exposure.indptr, table.exposure.indices, table.exposure.data
     difference = scratch_like(exposure, np.uint16)
 
-    def compare(row: int) -> Doubles:
+    def compare(row: int) -> tuple[Doubles, str]:
         entries = slice(start[row], start[row + 1])
-        difference[entries], counts = differences(points, views[row], near, columns[entries], exposure[entries])
-        return counts
+        view, fault = with_photograph(views[row])
+        difference[entries], counts = differences(points, view, near, columns[entries], exposure[entries])
+        return counts, fault
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        compared = with_bar(pool.map(compare, range(len(views))), "colors", len(views), progress)
-        counts = sum(compared, np.zeros((2, DIFFERENCES)))
-    return believed(table, difference, sight_ratios(counts))
+        compared = with_bar(pool.map(compare, range(len(views))), "colors", len(views), journal.progress)
+        counts, faults = zip(*compared, strict=True)
+    warn_of_faults(faults, journal)
+    return believed(table, difference, sight_ratios(np.sum(counts, axis=0)))
 
 
 def differences(
@@ -70,7 +74,7 @@ def differences(
 
     columns: (k,) rows of the points that the view shows, ascending. exposure: (k,) theirs, in (0, 1].
     """
-    image = readable_photograph(view)
+    image = view.image_rgb()
     if image is None or points.rgb is None:
         return np.full(len(columns), NO_COLOR, np.uint16), np.zeros((2, DIFFERENCES))
     camera = view.camera
@@ -80,12 +84,18 @@ def differences(
     )  # fmt: skip
 
 
-def readable_photograph(view: View) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 RGB; None where there is none, or it cannot be read: the checks of the capture say so."""
+def with_photograph(view: View) -> tuple[View, str]:
+    """The view with its photograph read, or without where it cannot be; then what is wrong with it, else ""."""
     try:
-        return view.image_rgb()
-    except SceneError:
-        return None
+        return replace(view, image=view.image_rgb()), ""
+    except SceneError as error:
+        return replace(view, image=None), str(error)
+
+
+def warn_of_faults(faults: Sequence[str], journal: Journal) -> None:
+    """faults: of each view, as of `with_photograph`. The checks of a capture ask for some photographs only."""
+    if found := [fault for fault in faults if fault]:
+        journal.warnings.append(f"photographs of {len(found)} of {len(faults)} views cannot be read: {found[0]}")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -4,6 +4,7 @@ may take of the machine where it runs, and the steps of a stage as tasks."""
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -87,9 +88,9 @@ def _with_share(function: Callable[[Item], Result], item: Item) -> Result:
     return function(item)
 
 
-def _end_with_parent() -> None:
-    """Started in each worker: it ends when its parent was killed, and with it its locks. Else it would wait for tasks
-    for good."""
+def _begin() -> None:
+    """Run in each worker: it ends when its parent was killed, and with it its locks. Else it would wait for tasks for
+    good. Where it has no task, Ctrl-C ends it without a word."""
 
     def watch() -> None:
         if (parent := parent_process()) is not None:
@@ -97,6 +98,30 @@ def _end_with_parent() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGINT, _end)
+    _hold_interrupts(False)
+
+
+def _end(*_: object) -> None:
+    os._exit(130)
+
+
+def _hold_interrupts(held: bool) -> None:
+    """Holds Ctrl-C back from this thread, and from processes that it starts from then on, or lets it through."""
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        from multiprocessing import resource_tracker
+
+        resource_tracker.ensure_running()  # as it starts, with the first process, it would let them through
+        signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _interruptible(fn: Callable[..., Result], *args: Any, **kwargs: Any) -> Result:
+    """A task in a worker: Ctrl-C raises KeyboardInterrupt in it, so that it puts in order what it has begun."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return fn(*args, **kwargs)
+    finally:
+        signal.signal(signal.SIGINT, _end)
 
 
 class LocalWorkers(ThreadPoolExecutor):
@@ -110,7 +135,8 @@ class LocalWorkers(ThreadPoolExecutor):
     def __init__(self, tasks: int) -> None:
         """tasks: how many there will be; there are as many processes at most, and as cores."""
         workers = max(1, min(tasks, cores_here(), free_memory() // 2 // LEAST_BYTES))
-        super().__init__(workers)
+        # Python, as it starts, would print where Ctrl-C met it: until `_begin` it is held back.
+        super().__init__(workers, initializer=_hold_interrupts, initargs=(True,))
         self.share, self._process_of = Share.of_machine(workers), threading.local()
         self._before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
         # Libraries read these as they are imported, before a task could set them: so processes inherit them.
@@ -122,9 +148,9 @@ class LocalWorkers(ThreadPoolExecutor):
 
     def _in_process(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
         process = getattr(self._process_of, "thread", None)
-        process = process or ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent)
+        process = process or ProcessPoolExecutor(1, get_context("spawn"), _begin)
         self._process_of.thread = None  # if this fails, the next task begins with a new one
-        result = process.submit(fn, *args, **kwargs).result()
+        result = process.submit(_interruptible, fn, *args, **kwargs).result()
         self._process_of.thread = process
         return result
 

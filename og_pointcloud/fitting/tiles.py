@@ -39,7 +39,14 @@ from og_pointcloud.fitting.membership import SceneVotes, assign_points, settled_
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.see_through import without_see_through
-from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, readable_photograph, sight_ratios
+from og_pointcloud.fitting.seen_colors import (
+    NO_COLOR,
+    believed,
+    differences,
+    sight_ratios,
+    warn_of_faults,
+    with_photograph,
+)
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
@@ -268,6 +275,7 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
     if drawn < inside:
         share = 1 - drawn / inside
         journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
+    warn_of_faults([view.fault for view in looked], journal)
     mask_view = np.repeat(np.arange(len(looked), dtype=np.int32), [view.mask_count for view in scene.views])
     first = np.array([view.first for view in looked])
     keys = tuple(view.key for view in looked)
@@ -286,7 +294,7 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
 class _LookedAt:
     """A view in the work folder. first: (tiles + 1,), as in `_Shown`. masked: how many of its entries are in masks.
     drawn: how many points were drawn, and how many there are in the image. colors: as `differences` counts them.
-    was_there: since an earlier run."""
+    was_there: since an earlier run. fault: of its photograph, as of `with_photograph`."""
 
     key: str
     first: Rows
@@ -294,19 +302,21 @@ class _LookedAt:
     drawn: NDArray[np.int64]
     colors: NDArray[np.float64]
     was_there: bool
+    fault: str
 
 
 def _look_at(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _LookedAt:
     """Render a view, or find it in the work folder; its entries stay there."""
     ids = view.mask_map()
-    view = replace(view, masks=ids, image=None if cloud.points.rgb is None else readable_photograph(view))
+    unread = replace(view, masks=ids, image=None if cloud.points.rgb is None else view.image)
+    view, fault = with_photograph(unread)
     drawn_as = cloud.key, drawing, FINEST_PX, MOST_SPLATS
     key = fingerprint(*drawn_as, view.name, view.image, view_fingerprint(view, ids))
     was_there = cloud.work.has("view", key)
     entries, drawn, colors = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
     first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
     masked = int(np.count_nonzero(entries["row"] < view.mask_count))
-    return _LookedAt(key, first, masked, drawn, colors, was_there)
+    return _LookedAt(key, first, masked, drawn, colors, was_there, fault)
 
 
 def _entries(
