@@ -18,6 +18,7 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.checking.check import (
     MOST_BLENDED,
     CaptureWarning,
+    _coordinates,
     check_capture,
     check_cloud,
     check_words,
@@ -106,6 +107,12 @@ def test_a_right_room_is_silent_and_every_check_is_made(seed):
 @pytest.mark.parametrize("options", [{"origin": (5e5, 4e6, 0), "scale": 100.0}, {"views": 3}, {"points": 1500}])
 def test_offsets_units_few_views_and_few_points_raise_no_doubt(options):
     assert doubts(tiled_room(2, **options)) == {}
+
+
+def test_points_at_one_place_have_no_coordinates_to_doubt():
+    for count in (1, 3):
+        points = Points(np.zeros((count, 3), np.float32), np.array([4e6, 5e5, 100.0]))
+        assert _coordinates(points) == []
 
 
 def test_map_coordinates_that_float32_rounded_are_a_doubt():

@@ -287,6 +287,7 @@ def test_tough_scenes(folder):
     clouds = {"no points": empty, "no instance": nothing, "no descriptor": plain, "good": scene(["desk"])}
     found = indexed(folder, clouds).find("desk", top=100)
     assert [finding.scene for finding in found] == ["good"]
+    (folder / "none").mkdir()
     with pytest.raises(OgPointcloudError, match=r"holds no \.ogpc file"):
         og.Collection.index(folder / "none", folder.parent / "atlas")
 
@@ -436,6 +437,13 @@ def test_commands(folder, capsys, tmp_path):
         said = capsys.readouterr().out
         assert (("nothing fits what was asked" in said), ("next: " in said)) == (says, not says)
     (folder / "room0.ogpc").unlink()
+    said = output_of(capsys, "find", atlas, "mug")
+    assert (f"{folder / 'room0.ogpc'} is there no longer" in said, "next: " in said) == (True, False)
+    (folder / "bad").mkdir()
+    (folder / "bad" / "x.ogpc").write_bytes(b"x")
+    assert "none of 1 file could be read" in error_of(capsys, "index", folder / "bad", "-o", tmp_path / "bad")
+    for path in (folder / "bad" / "x.ogpc", folder / "nowhere"):
+        assert f"'{path}' is no folder" in error_of(capsys, "index", path, "-o", tmp_path / "bad")
     assert "<b>mug" in error_of(capsys, "find", atlas, "<b>mug", "--html", page)
     assert main(["find", atlas, "mug", "--html", str(page)]) == 0
     assert "file not found" in page.read_text()

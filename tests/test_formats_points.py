@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,13 @@ def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, conte
     ) as caught:
         read_points(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")
+def test_a_pipe_is_refused_before_it_is_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    with pytest.raises(SceneError, match=r"pipe.ply: it is a pipe or a device; expected a file"):
+        read_points(tmp_path / "pipe.ply")
 
 
 def test_no_points_and_missing_columns_name_the_file_once(tmp_path):

@@ -188,4 +188,4 @@ def test_command(bundle, tmp_path, capsys):
     assert main(["instances", str(bundle), "--json", "--words", "1"]) == 0
     assert [len(record["words"]) for record in json.loads(capsys.readouterr().out)] == [1, 1, 1, 1, 0, 1, 1, 1, 1]
     assert "ends in .json or .csv" in error_of(capsys, "instances", bundle, "-o", tmp_path / "t.txt")
-    assert "expected 3 numbers" in error_of(capsys, "instances", bundle, "--up", "0,0")
+    assert "expected x, y, z, -x, -y, -z or a direction" in error_of(capsys, "instances", bundle, "--up", "0,0")

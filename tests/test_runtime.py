@@ -498,12 +498,19 @@ def test_colors_tell_labels_apart_and_do_not_depend_on_the_others():
             np.full((4, 3), 50.0),
             r"none of 4 points has a label: 4 are too far .* span 50..50 x .*reach is 0.15: .*frame and unit",
         ),
-        (np.full((4, 3), np.nan), "4 are too far from the scene$"),
+        (np.full((4, 3), np.nan), "4 are without finite coordinates$"),
     ],
 )
 def test_no_label_at_all_is_explained(scene, points, says):
     with pytest.warns(UserWarning, match=says):
         og.segment(points, ["apple"], scene)
+
+
+def test_points_without_finite_coordinates_are_not_called_far(scene):
+    points = np.vstack([scene.xyz[:5], np.full((2, 3), 90.0), [[np.nan, 0, 0], [0, 0, np.inf], [0, -np.inf, 0]]])
+    result = og.segment(points, ["apple"], scene)
+    assert (result.instances[5:] == og.TOO_FAR).all()
+    assert result.reasons[5:].tolist() == [og.Reason.TOO_FAR] * 2 + [og.Reason.NOT_FINITE] * 3
 
 
 def test_no_label_of_a_clouds_own_points_is_explained():

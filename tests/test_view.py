@@ -133,8 +133,8 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
         (["--html", "x.png"], "expected a name that ends in .html or .htm"),
         (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
         (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),
-        (["--html", "x.html", "--up", "0,0,0"], "--up is '0,0,0'; expected a direction"),
-        (["--html", "x.html", "--up", "w"], "--up is 'w'; expected 3 numbers"),
+        (["--html", "x.html", "--up", "0,0,0"], "--up is '0,0,0'; expected x, y, z, -x, -y, -z or a direction"),
+        (["--html", "x.html", "--up", "w"], "--up is 'w'; expected x, y, z, "),
     ],
 )
 def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, options, said):
@@ -145,8 +145,10 @@ def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, o
 
 def test_instances_are_shown_without_any_words(bundle, tmp_path, capsys):
     wordless = write_bundle(replace(og.load(bundle).cloud, vocabulary=None), tmp_path / "wordless.ogpc")
-    code, _, stderr = run(capsys, "view", wordless, "--instances")
+    code, stdout, stderr = run(capsys, "view", wordless, "--instances")
     assert (code, stderr) == (0, "")
+    assert "unknown" not in stdout
+    assert re.search(r"^\d+\.\d% of [\d,]+ points in \d+ instances$", stdout, re.MULTILINE)
     data = content(tmp_path / "wordless.html")
     assert (data["mode"], data["names"]) == ("instances", [])
     assert np.array_equal(data["instance"], og.load(bundle).instance_ids)

@@ -64,6 +64,8 @@ class Reason(IntEnum):
     """No view saw it."""
     TOO_FAR = 5
     """No point of the map within reach."""
+    NOT_FINITE = 6
+    """Its coordinates hold NaN or infinity."""
 
     def __str__(self) -> str:
         """The reason as part of a sentence on points: "12 are ..."."""
@@ -77,6 +79,7 @@ _IN_WORDS = {
     Reason.IN_NO_MASK: "background",
     Reason.UNOBSERVED: "unobserved",
     Reason.TOO_FAR: "too far from the scene",
+    Reason.NOT_FINITE: "without finite coordinates",
 }
 
 

@@ -332,6 +332,8 @@ class Segmenter:
                 local[instances == TOO_FAR] = np.inf  # certainty has no shorter reach than the scene's
             certainty_of = partial(scene._certainty_at, local)
         labels, scores, reasons = self._choice.at(instances)
+        far = np.flatnonzero(instances == TOO_FAR)
+        reasons[far[~np.isfinite(points[far]).all(axis=1)]] = Reason.NOT_FINITE
         result = Segmentation(
             points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
             certainty_of,
@@ -427,9 +429,8 @@ def _why_few(result: Segmentation, scene: LabelledScene, are_own: bool, pose: Ar
     they are the scene's own points."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
-    finite = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
-    far = int((finite & (result.reasons == Reason.TOO_FAR)).sum())
-    cause = "" if are_own else _misplaced(result.xyz[finite], far, scene, pose)
+    far = int((result.reasons == Reason.TOO_FAR).sum())
+    cause = "" if are_own else _misplaced(result.xyz[result.reasons != Reason.NOT_FINITE], far, scene, pose)
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"

@@ -41,7 +41,7 @@ MAX_MANIFEST_BYTES, MAX_NAMES_BYTES = 1 << 21, 1 << 23
 """Small, as parsed JSON takes up to twenty times its bytes in memory."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
-REBUILD = "write the file again with write_bundle"
+REBUILD = "copy the file again, or make it again (og-pointcloud fit)"
 BANK = "bank/vectors.npy"
 INSTANCE_MEMBERS = {"part_of": "whole"}
 """Columns of the instance table whose member has another name, as it was in the first files of schema 2."""

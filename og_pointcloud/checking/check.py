@@ -156,7 +156,7 @@ def _coordinates(points: Points) -> list[Check]:
     # A surface of n points is about as wide as the root of n times their distance.
     apart = float(np.ptp(points.xyz, axis=0).max()) / float(np.sqrt(len(points)))
     farthest = float(np.abs(points.origin).max())
-    if np.spacing(np.float32(farthest)) <= apart or (step := float32_step(points.xyz_world)) <= apart:
+    if apart == 0 or np.spacing(np.float32(farthest)) <= apart or (step := float32_step(points.xyz_world)) <= apart:
         return []
     says = (
         f"they are float32, in steps of {step:.3g} at {coordinate(farthest)}, and points lie about {apart:.2g} apart: "

@@ -19,7 +19,7 @@ from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, counted, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, counted, did_you_mean, printable
 from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
@@ -44,6 +44,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """With a guess at what was meant."""
+        if action.choices is not None and value not in action.choices:
+            expected = f"expected {', '.join(map(str, action.choices))}{did_you_mean(str(value), action.choices)}"
+            raise argparse.ArgumentError(action, f"{printable(str(value), LONGEST_CELL)!r} is unknown; {expected}")
 
 
 class Once(argparse.Action):
@@ -307,10 +313,13 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
     """The unit vector that --up names; None where it is not given."""
     if text is None or text in AXES:
         return AXES[text] if text else None
-    x, y, z = numbers(text, "--up", 3)
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        x = y = z = math.nan
     length = math.hypot(x, y, z)
     if not 0 < length < math.inf:
-        raise OgPointcloudError(f"--up is '{text}'; expected a direction, such as z or 0,0,1")
+        raise OgPointcloudError(f"--up is '{text}'; expected {', '.join(AXES)} or a direction such as 0,0.1,1")
     return x / length, y / length, z / length
 
 

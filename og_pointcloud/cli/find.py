@@ -66,7 +66,11 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"wrote {arguments.html}")
     if findings and findings[0].fits:  # by itself a word that fits nothing would label all of a scene without a bank
         best, given = findings[0], common.as_given(arguments, "--text-features")
-        common.print_next("view", collection.file(best.scene), "--labels", common.as_option([best.word]), *given)
+        file = collection.file(best.scene)
+        if file.is_file():
+            common.print_next("view", file, "--labels", common.as_option([best.word]), *given)
+        else:
+            print(f"{file} is there no longer: bring the index up to date")
 
 
 def cells(finding: Finding) -> tuple[str, ...]:

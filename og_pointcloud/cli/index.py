@@ -32,6 +32,8 @@ def run(arguments: argparse.Namespace) -> None:
     scenes = counted(len(collection.scenes), "scene")
     instances = counted(sum(entry.instances for entry in collection.entries), "instance")
     print(f"{changes}: {scenes} with {instances} in {arguments.output}")
+    if changes.left_out and not collection.scenes:
+        raise OgPointcloudError(f"none of {counted(len(changes.left_out), 'file')} could be read: make them again")
     if arguments.lance:
         from og_pointcloud.collection.lance import write_lance
 

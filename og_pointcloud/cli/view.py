@@ -10,7 +10,7 @@ import argparse
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.journal import Journal
 
 
@@ -53,6 +53,11 @@ def run(arguments: argparse.Namespace) -> None:
     page = arguments.html or arguments.bundle.with_suffix(".html")
     if left_out := write_page(page, scene, result, view, look, rgb):
         print(f"left out of the page: {left_out}")
-    print_segmentation(describe_segmentation(result, journal, arguments.bundle, page))
+    if result.names:
+        print_segmentation(describe_segmentation(result, journal, arguments.bundle, page))
+    else:  # --instances of a scene without words: no label was asked for
+        share = float((result.instances >= 0).mean())
+        print(f"{share:.1%} of {counted(len(result), 'point')} in {counted(len(scene.cloud.instances), 'instance')}")
+        print(f"wrote {page}")
     given = common.as_given(arguments, "--text-features", "--up")
     common.print_next("instances", arguments.bundle, *given, hint="what each instance is, and where: ")

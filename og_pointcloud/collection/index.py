@@ -55,10 +55,12 @@ class Changes:
 def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     """Bring an atlas up to date with all .ogpc files in a folder and the folders below.
 
-    path: of the atlas, which is made where there is none. OgPointcloudError where the folder holds no such file, or the
-    atlas cannot be written; it then stays as it was.
+    path: of the atlas, which is made where there is none. OgPointcloudError where that is no folder, or holds no such
+    file, or the atlas cannot be written; it then stays as it was.
     """
     root = Path(folder)
+    if not root.is_dir():
+        raise OgPointcloudError(f"'{root}' is no folder; expected the one with what og-pointcloud fit wrote")
     files = {file.relative_to(root).with_suffix("").as_posix(): file for file in sorted(root.rglob("*.ogpc"))}
     if not files:
         raise OgPointcloudError(f"'{root}' holds no .ogpc file; expected a folder with what og-pointcloud fit wrote")

@@ -74,6 +74,8 @@ def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_
 
 def _read(path: Path) -> Points | NDArray[np.void]:
     """A file's points; of a plain cloud in PLY or PCD its rows as they are."""
+    if path.exists() and not (path.is_file() or path.is_dir()):  # it would be read twice
+        raise SceneError("it is a pipe or a device; expected a file: write the cloud to one first")
     with path.open("rb") as file:
         head = file.read(4096)  # PCD headers may begin with comments
     if head.startswith((b"ply\n", b"ply\r", b"ply ")):
