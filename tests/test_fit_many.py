@@ -235,10 +235,11 @@ def test_ctrl_c_is_told_once_and_not_by_each_process(busy):
     """Neither while they start, nor in a task, nor by those that wait for one."""
     wait = "[workers.submit(abs, -1).result(), time.sleep(0.3)]" if busy else "None"
     code = (
-        "import time\nfrom og_pointcloud.fitting.tasks import LocalWorkers\nif __name__ == '__main__':\n"
-        f"    workers = LocalWorkers(2)\n    {wait}\n    workers.submit(time.sleep, 60)\n"
-        "    print('started', flush=True)\n"
-        "    try:\n        time.sleep(60)\n    except KeyboardInterrupt:\n        print('interrupted')\n"
+        "import signal, time\nfrom og_pointcloud.fitting.tasks import LocalWorkers\nif __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which a shell's background jobs ignore
+        f"    workers = LocalWorkers(2)\n    {wait}\n    workers.submit(time.sleep, 5)\n"
+        "    try:\n        print('started', flush=True)\n        time.sleep(60)\n"
+        "    except KeyboardInterrupt:\n        print('interrupted')\n"
     )
     started = subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True

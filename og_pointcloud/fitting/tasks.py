@@ -98,7 +98,8 @@ def _begin() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    signal.signal(signal.SIGINT, _end)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of what a shell starts in the background
+        signal.signal(signal.SIGINT, _end)
     _hold_interrupts(False)
 
 
@@ -117,6 +118,8 @@ def _hold_interrupts(held: bool) -> None:
 
 def _interruptible(fn: Callable[..., Result], *args: Any, **kwargs: Any) -> Result:
     """A task in a worker: Ctrl-C raises KeyboardInterrupt in it, so that it puts in order what it has begun."""
+    if signal.getsignal(signal.SIGINT) is not _end:
+        return fn(*args, **kwargs)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return fn(*args, **kwargs)
