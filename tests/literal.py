@@ -393,24 +393,3 @@ def paper_losses(image: Array, mask: NDArray[np.int64], bound: float) -> tuple[f
             by_mean[i] -= 4 * near**2 * apart / (count * (count - 1))
     of_separation = np.stack([by_mean[k] / (mask == k).sum() for k in mask])
     return float(separation), float(cohesion), of_separation.astype(float), of_cohesion.astype(float)
-
-
-def on_surface(xyz, index, nearest, of_few):
-    """`smoothing.on_surface`, point by point in float64."""
-    moved = np.array(xyz, np.float64)
-    for g in range(len(xyz)):
-        (few, _, _), (spread, height, normal) = (
-            _plane(np.array(xyz, np.float64)[np.append(g, index[g, :count])]) for count in (nearest, index.shape[1])
-        )
-        moved[g] -= min(1, of_few * few / spread) * height * normal
-    return moved
-
-
-def _plane(points):
-    """Variance of points off the plane that fits them best, height of the first of them, and the plane's normal; the
-    farther from the first, the less they count, the last one nothing."""
-    distance = np.linalg.norm(points - points[0], axis=1)
-    weight = 1 - (distance / distance[-1]) ** 2
-    mean = np.average(points, axis=0, weights=weight)
-    values, vectors = np.linalg.eigh(np.cov(points.T, aweights=weight, ddof=0))
-    return max(values[0], 0), (points[0] - mean) @ vectors[:, 0], vectors[:, 0]

@@ -689,12 +689,11 @@ def test_objects_know_since_when_they_stand_where_they_are():
 
 def test_snapshots_draw_points_as_large_as_a_fit_does():
     capture, given = scene(THINGS), without_depth(frames(THINGS))
-    geometry = replace(og.FitSettings().geometry, scales=(0.5, 0.7, 1.0))  # not the middle one is best
-    settings = og.FitSettings(geometry=geometry)
-    cloud = og.fit(capture, settings, progress=False)
-    mapper, _ = mapped(given, cloud=capture.points, settings=settings)
+    cloud = og.fit(capture, progress=False)
+    mapper, _ = mapped(given, cloud=capture.points)
     mapper.snapshot()
     known, scale = mapper._map, cloud.provenance["notes"]["gaussian_scale"]
+    geometry = og.FitSettings().geometry
     assert known.scale == scale != geometry.middle_scale
     fixed = og.FitSettings(geometry=replace(geometry, scales=(scale,)))
     for one, other in zip(known.kept.views, mapped(given, cloud=capture.points, settings=fixed)[0]._map.kept.views,

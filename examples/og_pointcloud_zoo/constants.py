@@ -56,8 +56,6 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.geometry.TAMED_BY": ("table", ()),
     "rendering.geometry.SPARSE": ("table", ()),
     "rendering.geometry.SCATTERED": ("table", ()),
-    "rendering.smoothing.NEAREST": ("table", ("_moved",)),
-    "rendering.smoothing.OF_FEW": ("table", ("_moved",)),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "fitting.association.CLEARLY": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -89,7 +87,6 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.view_reports.EXPECTED", "fitting.view_reports.UNSEEN", "fitting.view_reports.MORE_LIKELY",
         "fitting.view_reports.SMOOTHNESS", "fitting.view_reports.APART",
         "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",
-        "rendering.smoothing.NEAREST", "rendering.smoothing.OF_FEW",
         "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip

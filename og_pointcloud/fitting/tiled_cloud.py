@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -70,10 +70,9 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 class TiledCloud:
     """A cloud in the order of its tiles, read-only. Made by `TiledCloud.cut`.
 
-    points: as given. spacing, drawn_spacing, drawn_points: only once a stage has put them into the work folder.
-    members: per tile, its points and those within its margin, ascending; int32 as there are many. margins: (tiles,)
-    lengths in the scene's unit. key: fingerprint of points, tiles and settings. work: where all of it is, for other
-    processes too.
+    points, spacing (n,): spacing only once a stage has put it into the work folder. members: per tile, its points and
+    those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths in the scene's unit. key:
+    fingerprint of points, tiles and settings. work: where all of it is, for other processes too.
     """
 
     def __init__(self, work: WorkFolder, key: str) -> None:
@@ -111,17 +110,12 @@ class TiledCloud:
     @cached_property
     def spacing(self) -> NDArray[np.float32]:
         """(n,) float32, as `Neighborhood.spacing`."""
-        return self.work.arrays("spacing", self.key, vanished)[0][0]
+        return self.work.array("spacing", self.key, vanished)[0]
 
     @cached_property
     def drawn_spacing(self) -> NDArray[np.float32]:
         """(n,) float32, as of `geometry.drawn_spacing`."""
-        return self.work.arrays("spacing", self.key, vanished)[0][1]
-
-    @cached_property
-    def drawn_points(self) -> Points:
-        """The points where views are asked for them, as of `on_surface`."""
-        return replace(self.points, xyz=self.work.arrays("spacing", self.key, vanished)[1])
+        return self.work.array("spacing", self.key, vanished)[1]
 
     def inner(self, tile: int) -> slice:
         """Which of a tile's members are its own points and not of its margin: these lie in one stretch."""

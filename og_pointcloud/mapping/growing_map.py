@@ -47,9 +47,8 @@ class GrowingMap:
     """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought points. sequence: number
     of the next frame; 0 stands for what was known before the first. stamp: the latest of all frames; recent: those of
     the last RECENT_FRAMES, in the order of their coming. spacing: of each of the first rows, the points known from the
-    beginning. on_surface: (k, 3) where frames without depth are asked for these (rendering/smoothing.py). scale: how
-    large points are drawn for such frames, in spacings; None: not chosen yet. drawn: how many such frames were kept
-    when it was chosen."""
+    beginning. scale: how large points are drawn for frames without depth, in spacings; None: not chosen yet. drawn: how
+    many such frames were kept when it was chosen."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
@@ -63,7 +62,6 @@ class GrowingMap:
     stamp: float = -1.0
     recent: list[float] = field(default_factory=list)
     spacing: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    on_surface: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     scale: float | None = None
     drawn: int = 0
 
@@ -233,8 +231,7 @@ def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int
 def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
     """The points that a frame without depth sees: those that the map's own points, drawn as `fit` does, do not hide."""
     camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
-    xyz, spacing, first = known.points.xyz[rows], known.spacing_of(rows), rows < len(known.on_surface)
-    xyz[first] = known.on_surface[rows[first]]
+    xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
     depth = depths(xyz, camera)
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6

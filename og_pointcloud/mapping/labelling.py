@@ -15,7 +15,6 @@ from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points
 from og_pointcloud.mapping.kept_views import KeptView
 from og_pointcloud.rendering.geometry import Neighborhood, drawn_spacing, isotropic, near_plane
-from og_pointcloud.rendering.smoothing import on_surface
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
@@ -29,10 +28,9 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, s
     points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
     # First, as it may see the frames without depth anew: the table is made of what they see.
-    asked = replace(points, xyz=on_surface(points.xyz, around))
-    spacing = drawn_spacing(asked.xyz, around)
+    spacing = drawn_spacing(points.xyz, around)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), settings.geometry)
-    _choose_scale(known, asked, spacing, thickness, settings, journal)
+    _choose_scale(known, points, spacing, thickness, settings, journal)
     table = known.kept.table(place, len(rows))
     # The table holds all that the masks say; the scene's views are there for their cameras.
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
@@ -40,9 +38,9 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, s
     kept = zip(table.names, known.kept.views, strict=True)
     views = tuple(View(name, view.camera, no_mask, no_feature) for name, view in kept)
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
-    drawn = isotropic(asked, spacing, known.scale or geometry.middle_scale, geometry.opacity)
+    drawn = isotropic(points, spacing, known.scale or geometry.middle_scale, geometry.opacity)
     near = near_plane(points.xyz, (view.camera for view in views))
-    surface = Surface(replace(scene, points=asked), None, around, drawn, near, thickness, 1, by_sight=True)
+    surface = Surface(scene, None, around, drawn, near, thickness, 1, by_sight=True)
     table = front_surfaces(surface, table, settings, journal)
     return fit_prepared(Prepared(scene, surface, table), settings, journal)
 

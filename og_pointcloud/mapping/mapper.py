@@ -38,7 +38,6 @@ from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
-from og_pointcloud.rendering.smoothing import on_surface
 from og_pointcloud.scene import Points, require_finite, rounded_pose
 from og_pointcloud.settings import FitSettings, fit_settings
 
@@ -127,9 +126,7 @@ class Mapper:
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
         self._rows = self._map.points.add_known(points.xyz, points.rgb)
-        given = np.argsort(self._rows)
-        self._map.spacing = self._around.spacing[given]
-        self._map.on_surface = on_surface(points.xyz, self._around)[given]
+        self._map.spacing = self._around.spacing[np.argsort(self._rows)]
         self._map.grow()
         return self._map
 

@@ -20,7 +20,6 @@ from og_pointcloud.rendering.geometry import (
     neighborhood,
     thinned,
 )
-from og_pointcloud.rendering.smoothing import on_surface
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
@@ -30,11 +29,11 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (in mode paper Gaussians all stay), in order of place, each where views are asked
-    for it (`on_surface`, but in mode paper). n below is the number of its points.
+    scene: with one point per position (in mode paper Gaussians all stay), in order of place. n below is the number of
+    its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in their order.
-    neighborhood: spacing and neighbors of the n points where the scene has them. gaussians: how the n points are drawn.
+    neighborhood: spacing and neighbors of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
     stride: every stride-th row and column of the images is used; 1 but in mode paper.
@@ -73,8 +72,6 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighborhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
-        if not is_paper:
-            scene = replace(scene, points=replace(scene.points, xyz=on_surface(scene.points.xyz, around)))
         gaussians = _gaussians(scene, around, settings, journal)
         spacing, typical = around.spacing, float(np.median(around.spacing))
         thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=not is_paper)
