@@ -333,7 +333,7 @@ MUTATIONS = (
     ),
     Mutation(
         "what a box cuts off is found in it", "collection/scoring.py",
-        "bound[np.searchsorted(rows, self._outside(asked, box))] = -np.inf", "pass",
+        "bound[np.searchsorted(rows, self._outside(selected, box))] = -np.inf", "pass",
         ("test_collection.py::test_box_and_scenes_restrict",),
     ),
     Mutation(

@@ -89,7 +89,7 @@ def test_scores_are_those_of_each_scene_alone(judged):
 
 @pytest.mark.parametrize("top", [1, 3, 40])
 def test_the_best_are_found_without_scoring_all(judged, top, monkeypatch):
-    monkeypatch.setattr("og_pointcloud.collection.scoring.FIRST", 1)
+    monkeypatch.setattr("og_pointcloud.collection.scoring.FIRST_SCORED", 1)
     _, collection = judged
     for word in THINGS:
         everything, some = (collection.find(word, top=count) for count in (10_000, top))
@@ -376,7 +376,7 @@ def test_a_full_disk_leaves_nothing_of_a_new_atlas(tmp_path):
 
 
 def test_of_two_who_make_an_atlas_at_a_time_neither_removes_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("og_pointcloud.collection.store.PATIENCE_S", 0.1)
+    monkeypatch.setattr("og_pointcloud.collection.store.LOCK_TIMEOUT_S", 0.1)
     path, journal = tmp_path / "atlas", tmp_path / "atlas-journal"
     journal.write_bytes(bytes(600))  # of an atlas that was removed
     with Atlas.writing(path) as first:
@@ -495,7 +495,7 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
     uri, atlas = str(tmp_path / "lance"), str(folder.parent / "atlas")
     assert main(["index", str(folder), "-o", atlas, "--lance", uri]) == 0
     proposed = og.Collection(atlas, lance=uri)
-    monkeypatch.setattr("og_pointcloud.collection.collection.FEW_SCENES", 0)
+    monkeypatch.setattr("og_pointcloud.collection.collection.MAX_EXACT_SCENES", 0)
     box = ([1.5, -1, -1], [9, 1, 1])
     for options in ({}, {"within": box}, {"scenes": "site1/*"}, {"within": ([50, 50, 50], [51, 51, 51])}):
         for word in THINGS:

@@ -354,7 +354,7 @@ sys.path.insert(0, {tests!r})
 from og_pointcloud.mapping import map_journal
 from visits import CHEST, BIN, CRATE, frames, SPACE
 import og_pointcloud as og
-map_journal.LOG_BYTES = 1_500_000
+map_journal.MAX_LOG_BYTES = 1_500_000
 mapper = og.Mapper(feature_space=SPACE, journal={folder!r})
 for frame in frames([CHEST, BIN, CRATE]):
     mapper.integrate(frame)
@@ -366,7 +366,7 @@ for frame in frames([CHEST, BIN, CRATE]):
 def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
     from og_pointcloud.mapping import map_journal
 
-    monkeypatch.setattr(map_journal, "LOG_BYTES", 1_500_000)
+    monkeypatch.setattr(map_journal, "MAX_LOG_BYTES", 1_500_000)
     folder = tmp_path / "journal"
     code = textwrap.dedent(KILLED).format(tests=str(Path(__file__).parent), folder=str(folder))
     given = frames(THINGS)
@@ -484,7 +484,7 @@ def test_a_whole_map_that_cannot_be_written_costs_no_frame(tmp_path, monkeypatch
     def full(path):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(map_journal, "LOG_BYTES", 1000)
+    monkeypatch.setattr(map_journal, "MAX_LOG_BYTES", 1000)
     monkeypatch.setattr(map_journal, "replacing", full)
     mapper = og.Mapper(feature_space=SPACE, journal=tmp_path)
     with pytest.warns(UserWarning, match=r"map.state cannot be written \(No space left"):

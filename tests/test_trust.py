@@ -58,7 +58,7 @@ from og_pointcloud.formats.npy import npy_bytes, read_npz
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import numbered_images, read_numbers
 from og_pointcloud.formats.structure_from_motion import find_poses
-from og_pointcloud.mapping.map_journal import HEAD, MAGIC, MapJournal, packed
+from og_pointcloud.mapping.map_journal import MAGIC, RECORD_HEADER, MapJournal, packed
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 from og_pointcloud.text.encoder import TextEncoder, check_templates
 
@@ -667,7 +667,7 @@ def test_a_log_of_others_is_left_as_it_is(tmp_path):
 def test_a_state_that_holds_something_else(tmp_path):
     for value in (3, ("a", "b"), ["a"]):
         data = packed(value)
-        (tmp_path / "map.state").write_bytes(HEAD.pack(MAGIC, len(data), zlib.crc32(data)) + data)
+        (tmp_path / "map.state").write_bytes(RECORD_HEADER.pack(MAGIC, len(data), zlib.crc32(data)) + data)
         with pytest.raises(OgPointcloudError, match="is damaged, or another version's: remove the folder"):
             MapJournal(tmp_path, "nothing").state()
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, Vocabulary, unit_rows
 from og_pointcloud.collection.index import Changes, Family, Group, families, index
-from og_pointcloud.collection.lance import FEW_SCENES, LanceTables
-from og_pointcloud.collection.scoring import Block, load_block, share
+from og_pointcloud.collection.lance import MAX_EXACT_SCENES, LanceTables
+from og_pointcloud.collection.scoring import Block, load_block, sigmoid
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError, counted, did_you_mean
 from og_pointcloud.formats.atomic import StrPath
@@ -26,9 +26,9 @@ from og_pointcloud.scene import numbers_of
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.words import TextFeatures, resolve_labels, words_of
 
-TOP = 20
+DEFAULT_TOP = 20
 """Findings that are answered unless told otherwise."""
-SAME_WORD = 0.95
+SAME_WORD_COSINE = 0.95
 """Cosine from which two names are one word, which does not compete with itself: "mug" and "a mug"."""
 
 
@@ -151,7 +151,7 @@ class Collection:
         *,
         within: tuple[ArrayLike, ArrayLike] | None = None,
         scenes: str | Iterable[str] | None = None,
-        top: int = TOP,
+        top: int = DEFAULT_TOP,
         text_features: TextFeatures = None,
     ) -> Findings:
         """The instances that words fit best, of all scenes.
@@ -176,8 +176,8 @@ class Collection:
             given = resolve_labels(arrays, None, None, UNKNOWN_SPACE)
         box = None if within is None else _corners(within)
         self._open()
-        wanted = _Wanted(self._ids(scenes), box, top)
-        asked = [group for group in self._groups if wanted.among(group)]
+        query = _Query(self._ids(scenes), box, top)
+        asked = [group for group in self._groups if query.scenes_of(group)]
         vectors = [self._vectors(group.family, names, features, given) for group in asked]
         if not any(vectors):
             if given is not None and asked:
@@ -189,14 +189,14 @@ class Collection:
             pair
             for group, known in zip(asked, vectors, strict=True)
             for word, vector in known.items()
-            for pair in self._best(group, wanted, word, vector)
+            for pair in self._best(group, query, word, vector)
         ]
         ranked.sort(key=lambda pair: -pair[0])  # stable: of equals the first
         # Scenes that could not be asked for a word, by word and feature space.
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
             for word in set(names) - known.keys():
-                counts[word, group.family.feature_space] += len(wanted.among(group))
+                counts[word, group.family.feature_space] += len(query.scenes_of(group))
         not_asked = tuple(
             f"{counted(count, 'scene')} of feature space '{space}' could not be asked for '{word}': its vector there "
             "is not known"
@@ -251,31 +251,31 @@ class Collection:
         return find_encoder(family.feature_space) if len(of_space) == 1 else None
 
     def _best(
-        self, group: Group, wanted: _Wanted, word: str, vector: NDArray[np.float32]
+        self, group: Group, query: _Query, word: str, vector: NDArray[np.float32]
     ) -> list[tuple[float, Finding]]:
         """The best of a group for a word, with what they are ranked by."""
-        block = self._blocks.get(group.name) or self._block(group, wanted, vector)
+        block = self._blocks.get(group.name) or self._block(group, query, vector)
         # A block holds a whole group or more than was asked for: its ranking leaves the rest out.
-        asked = np.ones(len(block.entries), bool) if wanted.ids is None else np.isin(block.ids, list(wanted.ids))
+        asked = np.ones(len(block.entries), bool) if query.ids is None else np.isin(block.ids, list(query.ids))
         words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))  # unit vectors
-        rivals = words[words @ vector < SAME_WORD]
-        ranked = zip(*block.rank(vector, rivals, asked, wanted.top, wanted.box), strict=True)
-        return [(key, _finding(block, row, word, float(share(key)))) for row, key in ranked]
+        rivals = words[words @ vector < SAME_WORD_COSINE]
+        ranked = zip(*block.rank(vector, rivals, asked, query.top, query.box), strict=True)
+        return [(key, _finding(block, row, word, float(sigmoid(key)))) for row, key in ranked]
 
-    def _block(self, group: Group, wanted: _Wanted, vector: NDArray[np.float32]) -> Block:
+    def _block(self, group: Group, query: _Query, vector: NDArray[np.float32]) -> Block:
         """The scenes of a group that are asked and meet the box; of these only those that LanceDB proposes, if it is
         used. A block of the whole group is kept for later questions, one of some scenes is read each time."""
-        here = wanted.among(group)
+        here = query.scenes_of(group)
         with Atlas.reading(self.path) as atlas:
-            ids = atlas.within(*wanted.box) if wanted.box is not None else {entry.id for entry in here}
+            ids = atlas.within(*query.box) if query.box is not None else {entry.id for entry in here}
             near = [entry for entry in here if entry.id in ids] or here[:1]
             is_all = len(near) == len(group.entries)
-            if self._lance is not None and (is_all or len(near) > FEW_SCENES):
+            if self._lance is not None and (is_all or len(near) > MAX_EXACT_SCENES):
                 direction = load_block(atlas, near[:1]).direction(vector)
                 # Where all scenes are asked, the box alone is the condition: no list of ids is needed.
                 ids_asked = None if len(here) == len(group.entries) else [entry.id for entry in near]
                 part = len(near) / len(group.entries)
-                proposed = self._lance.propose(group.name, direction, wanted.box, ids_asked, wanted.top, part)
+                proposed = self._lance.propose(group.name, direction, query.box, ids_asked, query.top, part)
                 return load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
             block = load_block(atlas, atlas.side_by_side(near))
         if is_all:
@@ -284,7 +284,7 @@ class Collection:
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Query:
     """What may be found. ids: of the scenes asked, None for all. box: (2, 3) corners that the instance's middle must
     lie between, None for anywhere. top: how many."""
 
@@ -292,7 +292,7 @@ class _Wanted:
     box: NDArray[np.float64] | None
     top: int
 
-    def among(self, group: Group) -> Sequence[SceneEntry]:
+    def scenes_of(self, group: Group) -> Sequence[SceneEntry]:
         """Those scenes of a group in which it may lie."""
         if self.ids is None:
             return group.entries

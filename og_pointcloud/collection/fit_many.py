@@ -55,7 +55,7 @@ class CaptureFit:
     """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
     cause. worker: where, as host:process, or "lost". peak_bytes: the most memory that this process has held, 0 if
     unknown. doubts: names of the checks that failed (the file's provenance says why). warnings: what else was to be
-    told of it.
+    messages of it.
 
     >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
     'kitchen'
@@ -186,12 +186,12 @@ def _is_whole(path: Path) -> bool:
 def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> CaptureFit:
     """The task: never raises, as not every error survives the way back from another process."""
     start, worker = time.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
-    told: list[str] = []
+    messages: list[str] = []
     try:
-        with _recorded(told):
+        with _recorded(messages):
             cloud = _fit(Path(capture), Path(output), options, share_here(share))
     except Exception as error:
-        # Our own errors, the system's and missing extras say what is wrong; of any other the kind is told too.
+        # Our own errors, the system's and missing extras say what is wrong; of any other the kind is messages too.
         expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
         cause = str(error) if expected and str(error) else f"{type(error).__name__}: {error}"
         if isinstance(error, OSError) and error.filename:
@@ -200,13 +200,13 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
     else:
         doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
         result = CaptureFit(capture, output, "fitted", points=len(cloud), instances=len(cloud.instances), doubts=doubts)
-        told += cloud.provenance["warnings"]
+        messages += cloud.provenance["warnings"]
     seconds = round(time.perf_counter() - start, 3)
-    return replace(result, seconds=seconds, worker=worker, peak_bytes=peak_memory(), warnings=tuple(told))
+    return replace(result, seconds=seconds, worker=worker, peak_bytes=peak_memory(), warnings=tuple(messages))
 
 
 @contextmanager
-def _recorded(told: list[str]) -> Iterator[None]:
+def _recorded(messages: list[str]) -> Iterator[None]:
     """Adds the warnings that a fit gives to ``told``, but for doubts, which its provenance has. Python cannot tell
     apart those of several threads: in a thread they go where they always do."""
     if threading.current_thread() is not threading.main_thread():
@@ -218,7 +218,7 @@ def _recorded(told: list[str]) -> Iterator[None]:
         try:
             yield
         finally:
-            told += [str(warning.message) for warning in found if not issubclass(warning.category, CaptureWarning)]
+            messages += [str(warning.message) for warning in found if not issubclass(warning.category, CaptureWarning)]
 
 
 def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:
@@ -229,7 +229,7 @@ def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> Labe
     settings = replace(options.settings, memory=min(limits, default=None))
     work = output.with_name(f"{output.name}.work")
     cloud = fit_capture(capture, replace(options, settings=settings), work=work)
-    cloud = replace(cloud, provenance=_without_circumstances(cloud.provenance, options.settings))
+    cloud = replace(cloud, provenance=_reproducible(cloud.provenance, options.settings))
     import_plugin("og_pointcloud_export", "fit").write_bundle(cloud, output)
     return cloud
 
@@ -248,7 +248,7 @@ def fit_capture(
     return replace(cloud, provenance={**cloud.provenance, "stages": [reading, *cloud.provenance["stages"]]})
 
 
-def _without_circumstances(provenance: dict[str, Any], settings: FitSettings) -> dict[str, Any]:
+def _reproducible(provenance: dict[str, Any], settings: FitSettings) -> dict[str, Any]:
     """Provenance without what depends on where, when and beside what a fit ran: files are equal byte for byte."""
     return {
         **provenance,

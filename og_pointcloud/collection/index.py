@@ -30,7 +30,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.journal import with_bar
 
-SAME_ENCODER = 0.5
+SAME_ENCODER_COSINE = 0.5
 """Mean cosine of the words that two scenes share, above which one encoder made both: the same word in other templates
 has about 0.9, in another encoder's space about 0."""
 
@@ -71,7 +71,7 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
         others = [name for name, file in files.items() if name not in known or not _is_same(file, known[name])]
         for name in with_bar(others, "index", len(others), progress):
             try:
-                if _take(atlas, name, files[name], known.get(name)):
+                if _add_file(atlas, name, files[name], known.get(name)):
                     (replaced if name in known else added).append(name)
             except (OgPointcloudError, OSError) as error:  # one bad file does not cost the others
                 left_out.append((name, str(error)))
@@ -90,7 +90,7 @@ def _is_same(file: Path, entry: SceneEntry) -> bool:
     return state is not None and (state.st_size, state.st_mtime_ns) == (entry.bytes, entry.modified)
 
 
-def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
+def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
     """Put a .ogpc file into the atlas; False where only its date is new, not its content."""
     if not file.is_file():
         raise OgPointcloudError(f"{file} is no file; expected one")  # a device or a pipe never ends
@@ -193,7 +193,7 @@ def _words(atlas: Atlas, digest: str, width: int) -> dict[str, NDArray[np.float3
 def _agree(first: Mapping[str, NDArray[np.float32]], second: Mapping[str, NDArray[np.float32]]) -> bool:
     """Whether the words that both know have about the same unit vectors; true where they share none."""
     shared = first.keys() & second.keys()
-    return not shared or float(np.mean([first[name] @ second[name] for name in shared])) > SAME_ENCODER
+    return not shared or float(np.mean([first[name] @ second[name] for name in shared])) > SAME_ENCODER_COSINE
 
 
 def judge_scenes(atlas: Atlas) -> None:

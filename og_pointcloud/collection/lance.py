@@ -22,14 +22,14 @@ from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import OgPointcloudError, naming_extra
 from og_pointcloud.formats.atomic import StrPath
 
-INDEXED_FROM = 50_000
+MIN_INDEXED_ROWS = 50_000
 """Rows from which a table has an index; of fewer every one is compared."""
-ROWS_A_PARTITION = 4_000
-SCENES_AT_ONCE = FEW_SCENES = 200
+ROWS_PER_PARTITION = 4_000
+SCENES_PER_WRITE = MAX_EXACT_SCENES = 200
 """Scenes written at once; and scenes up to which the atlas is asked, exactly: their rows lie in all partitions."""
-PROPOSED = 50
+PROPOSED_ROWS = 50
 """Rows proposed for each instance wanted: a row's rank by evidence is not yet its rank by probability."""
-PROBES, REFINE = 64, 8
+SEARCHED_PARTITIONS, REFINE_FACTOR = 64, 8
 """Partitions that are searched, and how many times the rows asked for are compared in full precision: recall against
 time. On 200,000 made descriptors the recall at 10 was 1.00; with 24 and 4 it was 0.97 (docs/scale.md)."""
 
@@ -53,11 +53,11 @@ def write_lance(atlas: StrPath, uri: str) -> None:
             schema = pa.schema([*numbers.items(), ("vector", vector)])
             table = database.create_table(group.name, schema=schema, mode="overwrite")
             # Added in parts, not as a generator: LanceDB would read that in another thread, where SQLite refuses.
-            for start in range(0, len(group.entries), SCENES_AT_ONCE):
-                block = load_block(opened, group.entries[start : start + SCENES_AT_ONCE])
+            for start in range(0, len(group.entries), SCENES_PER_WRITE):
+                block = load_block(opened, group.entries[start : start + SCENES_PER_WRITE])
                 table.add(pa.Table.from_arrays(_columns(block), schema=schema))
-            if (count := table.count_rows()) >= INDEXED_FROM:
-                partitions = max(8, count // ROWS_A_PARTITION)
+            if (count := table.count_rows()) >= MIN_INDEXED_ROWS:
+                partitions = max(8, count // ROWS_PER_PARTITION)
                 table.create_index(metric="dot", index_type="IVF_SQ", num_partitions=partitions)
     with Atlas.writing(atlas) as opened:
         opened.note(_name(uri), written)
@@ -117,7 +117,7 @@ class LanceTables:
                 "again with og-pointcloud index --lance"
             ) from None
         query = table.search(np.append(direction, np.float32(1)), vector_column_name="vector").distance_type("dot")
-        query = query.nprobes(ceil(PROBES / share)).refine_factor(REFINE).limit(PROPOSED * top)
+        query = query.nprobes(ceil(SEARCHED_PARTITIONS / share)).refine_factor(REFINE_FACTOR).limit(PROPOSED_ROWS * top)
         conditions = [] if scenes is None else [f"scene IN ({', '.join(map(str, scenes))})"]
         if box is not None:
             corners = zip("xyz", *box.tolist(), strict=True)

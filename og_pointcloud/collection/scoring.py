@@ -3,7 +3,7 @@
 An instance's evidence is one inner product for each descriptor, scaled and shifted (`choosing.Standard`), so one pass
 over the descriptors gives all of it. Its probability also depends on what other words of the bank say, which is a
 hundred times the work; but evidence alone bounds it from above. So instances are scored in the order of their bounds,
-until no other can reach the places that are asked for.
+until no other can reach the places that are selected for.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from og_pointcloud.settings import ChoosingSettings
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4), as
 in its released code; the paper gives none."""
-ROWS_AT_ONCE = 512
+ROWS_PER_BATCH = 512
 """Instances whose descriptors are gathered for one product: few enough to stay in a core's cache."""
-FIRST = 64
+FIRST_SCORED = 64
 """Instances scored to the end at first; then four times as many each time, until it is enough."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """S scenes that are asked alike: of one encoder, and judged by one word bank or by none. I instances, those with a
-    point and a descriptor, scene after scene.
+    """S scenes that are selected alike: of one encoder, and judged by one word bank or by none. I instances, those with
+    a point and a descriptor, scene after scene.
 
     vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
     descriptor in standard deviations of the judge's words; without a judge the cosine. bounds: (I + 1,) where each
@@ -69,7 +69,7 @@ class Block:
         return np.searchsorted(self.scene, np.arange(len(self.entries) + 1))
 
     @cached_property
-    def _reach(self) -> DoubleArray:
+    def _center_bounds(self) -> DoubleArray:
         """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; infinite, which meets no box,
         for a scene without any."""
         reach = np.full((len(self.entries), 2, 3), np.inf)
@@ -79,7 +79,7 @@ class Block:
         return reach
 
     @cached_property
-    def _bound(self) -> DoubleArray:
+    def _logit_bound(self) -> DoubleArray:
         """(2, I) factor and summand: the logit of an instance's score is at most factor * evidence + summand."""
         # `_relevancy` and `_log_odds` with the least that rivals can say: a cosine of -1, and what chance gives.
         if self.bank is None:
@@ -88,27 +88,27 @@ class Block:
         return np.stack([sharpness, -(sharpness**2) / 2 - np.log(ChoosingSettings().kinds)])
 
     @cached_property
-    def _judges(self) -> tuple[FloatArray, FloatArray]:
+    def _bank_words(self) -> tuple[FloatArray, FloatArray]:
         """(D,) what the words of the bank share, and (B, D) unit rows of what they do not."""
         assert self.bank is not None
         return self.bank.mean, unit_rows(self.bank.vectors - self.bank.mean)
 
     def meets(self, box: DoubleArray) -> NDArray[np.bool_]:
         """(S,) whether a scene may have an instance with its middle in a box (2, 3)."""
-        return ((self._reach[:, 0] <= box[1]) & (self._reach[:, 1] >= box[0])).all(axis=1)
+        return ((self._center_bounds[:, 0] <= box[1]) & (self._center_bounds[:, 1] >= box[0])).all(axis=1)
 
     def direction(self, text: FloatArray) -> FloatArray:
         """(D,) unit vector of a text (D,) whose products with the vectors say how it fits."""
-        return unit_rows(text if self.bank is None else unit_rows(text) - self._judges[0]).astype(np.float32)
+        return unit_rows(text if self.bank is None else unit_rows(text) - self._bank_words[0]).astype(np.float32)
 
     def evidence(self, rows: NDArray[np.intp], directions: FloatArray) -> FloatArray:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
         best = np.empty((len(rows), len(directions)), np.float32)
-        for start in range(0, len(rows), ROWS_AT_ONCE):
-            part = rows[start : start + ROWS_AT_ONCE]
+        for start in range(0, len(rows), ROWS_PER_BATCH):
+            part = rows[start : start + ROWS_PER_BATCH]
             begins, ends = self.bounds[part], self.bounds[part + 1]
             first = np.cumsum(ends - begins) - (ends - begins)
-            best[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
+            best[start : start + ROWS_PER_BATCH] = self._best_of(_ranges(begins, ends), first, directions)
         return best
 
     def _best_of(self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: FloatArray) -> FloatArray:
@@ -122,30 +122,30 @@ class Block:
         self,
         text: FloatArray,
         rivals: FloatArray,
-        asked: NDArray[np.bool_],
+        selected: NDArray[np.bool_],
         top: int,
         box: DoubleArray | None = None,
     ) -> tuple[NDArray[np.intp], DoubleArray]:
         """The best ``top`` instances of scenes for a text (D,), of equals the first, and the logit of their scores.
 
-        asked: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
+        selected: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
         With a judge the score is the probability that the instance is what the text says, as `og.select` has it
         against no other word. Without, it is LERF's relevancy against rivals (M, D), unit rows.
         """
         if box is not None:
-            asked = asked & self.meets(box)
+            selected = selected & self.meets(box)
         # Runs of neighboring scenes, as (begin, end) of instances: their descriptors are multiplied in place, uncopied.
-        edges = np.flatnonzero(np.diff(asked, prepend=False, append=False))
+        edges = np.flatnonzero(np.diff(selected, prepend=False, append=False))
         runs = self._starts[edges].reshape(-1, 2)
         direction = self.direction(text)[None]
         bound = np.concatenate([np.zeros(0), *(self._bounds_of(begin, end, direction) for begin, end in runs.tolist())])
         rows = _ranges(*runs.T)
         if box is not None:
-            bound[np.searchsorted(rows, self._outside(asked, box))] = -np.inf
+            bound[np.searchsorted(rows, self._outside(selected, box))] = -np.inf
         key_of = self._relevancy
         if self.bank is not None:
             key_of = self._log_odds
-            _, rivals = self._judges
+            _, rivals = self._bank_words
             rivals = rivals[(rivals @ direction[0]) < ChoosingSettings().synonym]  # words of another meaning
         best, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
         return rows[best], key
@@ -154,12 +154,12 @@ class Block:
         """(end - begin,) bounds of the scores of neighboring instances for a direction (1, D)."""
         rows = slice(*self.bounds[[begin, end]].tolist())
         evidence = self._best_of(rows, self.bounds[begin:end] - rows.start, direction)[:, 0]
-        factor, summand = self._bound[:, begin:end]
+        factor, summand = self._logit_bound[:, begin:end]
         return factor * evidence + summand
 
-    def _outside(self, asked: NDArray[np.bool_], box: DoubleArray) -> NDArray[np.intp]:
+    def _outside(self, selected: NDArray[np.bool_], box: DoubleArray) -> NDArray[np.intp]:
         """The instances of scenes that have their middles outside of a box; only scenes that it cuts have any."""
-        is_cut = asked & ((self._reach[:, 0] < box[0]) | (self._reach[:, 1] > box[1])).any(axis=1)
+        is_cut = selected & ((self._center_bounds[:, 0] < box[0]) | (self._center_bounds[:, 1] > box[1])).any(axis=1)
         rows = _ranges(self._starts[:-1][is_cut], self._starts[1:][is_cut])
         middle = self.center[rows]
         return rows[((middle < box[0]) | (middle > box[1])).any(axis=1)]
@@ -185,11 +185,11 @@ def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp
 def largest(
     bound: DoubleArray, key_of: Callable[[NDArray[np.intp]], DoubleArray], top: int
 ) -> tuple[NDArray[np.intp], DoubleArray]:
-    """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are asked for.
+    """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are selected for.
 
     bound: (n,) what the keys do not exceed; places of -inf are none. key_of: the keys of some places.
     """
-    known, key, count = np.zeros(0, np.intp), np.zeros(0), FIRST + top
+    known, key, count = np.zeros(0, np.intp), np.zeros(0), FIRST_SCORED + top
     while True:
         tried = np.argpartition(-bound, count)[:count] if count < len(bound) else np.arange(len(bound))
         tried = tried[bound[tried] > -np.inf]
@@ -202,7 +202,7 @@ def largest(
         count *= 4
 
 
-def share(logit: DoubleArray) -> DoubleArray:
+def sigmoid(logit: DoubleArray) -> DoubleArray:
     """The probability of a logit."""
     return 1 / (1 + np.exp(-np.clip(logit, -700, 700)))
 

@@ -28,7 +28,7 @@ from og_pointcloud.cloud import InstanceTable, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath, replacing
 
-APPLICATION, VERSION = 0x4F474154, 2
+APPLICATION_ID, VERSION = 0x4F474154, 2
 """SQLite's application_id ("OGAT") and user_version; the second is raised when older atlases cannot be read."""
 SCHEMA = (
     "CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL)",
@@ -41,18 +41,18 @@ SCHEMA = (
     "standard BLOB NOT NULL)",
     "CREATE VIRTUAL TABLE boxes USING rtree(id, x0, x1, y0, y1, z0, z1)",
 )
-ENTRY = (
+ENTRY_COLUMNS = (
     "id, CAST(name AS TEXT), CAST(digest AS TEXT), CAST(feature_space AS TEXT), bytes, modified, "
     "max(0, CAST(width AS INTEGER)), encoder, vocabulary, bank, judge, length(instances), length(descriptors)"
 )
 """Columns of a `SceneEntry`; cast, since SQLite does not hold columns to their types."""
-EVIDENCE = np.dtype([
+INSTANCE_RECORD = np.dtype([
     ("points", "<i4"), ("views", "<i4"), ("masks", "<i4"), ("part_of", "<i4"), ("agreement", "<f4"),
     ("visible_area", "<f4"), ("box", "<f8", (2, 3)),
 ])  # fmt: skip
 """What an atlas knows of an instance: columns of its `InstanceTable`, and the low and high corner of the axis-aligned
 box of its main part, in the scene's unit, 0 where it has no points."""
-PATIENCE_S = 30.0
+LOCK_TIMEOUT_S = 30.0
 """How long a change waits for another one."""
 
 
@@ -113,7 +113,7 @@ class Atlas:
                 yield atlas
                 atlas._run("COMMIT")
             return
-        marks = (f"PRAGMA application_id = {APPLICATION}", f"PRAGMA user_version = {VERSION}")
+        marks = (f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {VERSION}")
         with replacing(path) as file, cls._connected(path, "rw", Path(file.name)) as atlas:
             path.with_name(f"{path.name}-journal").unlink(missing_ok=True)  # of one that is no more: it would be undone
             for statement in ("PRAGMA journal_mode = MEMORY", "BEGIN IMMEDIATE", *SCHEMA, *marks):
@@ -127,7 +127,7 @@ class Atlas:
         """file: where it lies until it takes its place."""
         uri = f"{(file or path).resolve().as_uri()}?mode={mode}"
         try:
-            with closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE_S, isolation_level=None)) as connection:
+            with closing(sqlite3.connect(uri, uri=True, timeout=LOCK_TIMEOUT_S, isolation_level=None)) as connection:
                 # What SQLite advises for a file that may be hostile (sqlite.org/security.html).
                 connection.execute("PRAGMA trusted_schema = OFF")
                 connection.execute("PRAGMA cell_size_check = ON")
@@ -138,8 +138,8 @@ class Atlas:
     def _check(self) -> None:
         """Refuse other databases, and those with views, triggers or columns that none of ours has."""
         marks = tuple(self._run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
-        if marks != (APPLICATION, VERSION):
-            raise _refused(self.path, f"its application and version are {marks}; expected {(APPLICATION, VERSION)}")
+        if marks != (APPLICATION_ID, VERSION):
+            raise _refused(self.path, f"its application and version are {marks}; expected {(APPLICATION_ID, VERSION)}")
         # SQLite keeps the text of each CREATE. Indices that it makes by itself have none; the R*Tree's own tables,
         # boxes_*, have texts of its own.
         query = "SELECT sql FROM sqlite_master WHERE sql <> '' AND NOT (type = 'table' AND name GLOB 'boxes_*')"
@@ -166,34 +166,34 @@ class Atlas:
 
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
-        rows = self._run(f"SELECT {ENTRY} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name")
+        rows = self._run(f"SELECT {ENTRY_COLUMNS} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name")
         # The last two columns are lengths of blobs in bytes: of records of instances, and of float32 numbers.
-        counted = ((row[:-2], row[-2] // EVIDENCE.itemsize, row[-1] // 4) for row in rows)
+        counted = ((row[:-2], row[-2] // INSTANCE_RECORD.itemsize, row[-1] // 4) for row in rows)
         return [SceneEntry(*row, instances=size, numbers=numbers) for row, size, numbers in counted]
 
     def instances(self, entry: SceneEntry) -> tuple[InstanceTable, NDArray[np.float64]]:
         """The instances of a scene, with unit descriptors, and (K, 2, 3) low and high corners of their boxes."""
         statement = "SELECT instances, owner, descriptors FROM scenes WHERE id = ? AND digest = ?"
-        with self._distrust(f"the instances of '{entry.name}'"):
+        with self._refusing_damage(f"the instances of '{entry.name}'"):
             row = self._run(statement, (entry.id, entry.digest)).fetchone()
             if row is None:
                 raise ValueError("it was indexed again meanwhile")
-            rows, owner = np.frombuffer(row[0], EVIDENCE), np.frombuffer(row[1], "<i4")
-            columns = {name: rows[name].copy() for name in EVIDENCE.names or () if name != "box"}
+            rows, owner = np.frombuffer(row[0], INSTANCE_RECORD), np.frombuffer(row[1], "<i4")
+            columns = {name: rows[name].copy() for name in INSTANCE_RECORD.names or () if name != "box"}
             table = InstanceTable(_floats(row[2], len(owner), entry.width), owner, **columns)
             return table, _finite(rows["box"])
 
     def judgement(self, entry: SceneEntry, rows: int) -> Standard:
         """What its judge makes of a scene's descriptors. rows: how many it has."""
         statement = "SELECT sharpness, standard FROM judgements WHERE scene = ?"
-        with self._distrust(f"the judgement of '{entry.name}'"):
+        with self._refusing_damage(f"the judgement of '{entry.name}'"):
             sharpness, blob = self._run(statement, (entry.id,)).fetchone()
             parts = np.split(_floats(blob, entry.width + 2 * rows), [entry.width, entry.width + rows])
             return Standard(*parts, sharpness=float(_finite(np.float64(sharpness))))
 
     def words(self, digest: str) -> Vocabulary:
         """A vocabulary, or a bank, whose names are empty."""
-        with self._distrust(f"the words {digest!r:.40}"):
+        with self._refusing_damage(f"the words {digest!r:.40}"):
             row = self._run("SELECT names, width, vectors FROM words WHERE digest = ?", (digest,)).fetchone()
             names = tuple(str(name) for name in json.loads(row[0]))
             return Vocabulary(names, _floats(row[2], len(names), int(row[1])))
@@ -201,7 +201,7 @@ class Atlas:
     def bank(self, digest: str, width: int) -> WordBank:
         """The words that judge descriptors of a width."""
         vectors = self.words(digest).vectors
-        with self._distrust(f"the bank {digest!r:.40}"):
+        with self._refusing_damage(f"the bank {digest!r:.40}"):
             if vectors.shape[1] != width:
                 raise ValueError(f"its words have width {vectors.shape[1]}, what they judge {width}")
             return WordBank(vectors)
@@ -224,7 +224,7 @@ class Atlas:
         return [entries[row] for row in np.argsort(code, kind="stable")]
 
     @contextmanager
-    def _distrust(self, what: str) -> Iterator[None]:
+    def _refusing_damage(self, what: str) -> Iterator[None]:
         try:
             yield
         except (OgPointcloudError, ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -239,8 +239,8 @@ class Atlas:
     def add(self, entry: SceneEntry, table: InstanceTable, boxes: NDArray[np.float64]) -> None:
         """A scene, in place of one of the same name. Its id is given here, its judgement later. boxes: (K, 2, 3)."""
         self.remove(entry.name)
-        rows = np.zeros(len(table), EVIDENCE)
-        for name in EVIDENCE.names or ():
+        rows = np.zeros(len(table), INSTANCE_RECORD)
+        for name in INSTANCE_RECORD.names or ():
             rows[name] = boxes if name == "box" else getattr(table, name)
         blobs = (rows.tobytes(), table.descriptor_instance.tobytes(), table.descriptors.tobytes())
         values = (None, *astuple(entry)[1:-3], *blobs)

@@ -1,17 +1,17 @@
 """Two visits of a place: what is gone, what is new, what moved, and what nobody looked at again.
 
-Both visits are clouds with the cameras that saw them. For each point of the earlier visit, the later one's views tell
-whether it is still there or whether they see through its place; for each point of the later visit, the earlier one's
-views tell whether it was there already. By instance, over the points that show and that can tell:
+Both visits are clouds with the cameras that saw them. For each point of the earlier visit, the later views tell whether
+it is still there or is seen through; for each point of the later visit, the earlier views tell whether it was there
+already. By instance, over the visible points that are evidence:
 
     gone     most of them are seen through later, from two places
-    new      most of them lie where the earlier visit had looked through, from two places
-    moved    a new instance that looks like a gone one; like one that had left before, it is new, and back
-    unseen   so few of them are looked at later that nothing is known; or the later visit's cloud leaves out so much
-             of what stands near them that it may have left them out by chance
+    new      most of them lie where the earlier visit had seen through, from two places
+    moved    a new instance that looks like a gone one; if it looks like one that had left before, it is new, and back
+    unseen   too few of them are looked at later to know anything; or the later visit's cloud lacks so many points near
+             them that theirs may be missing by chance
 
-Points close to the surface of something else cannot tell: when a book is gone, its lower edge still agrees with the
-table. Whatever lies where the earlier visit never looked is neither new nor old: it is added to a map, not reported.
+Points close to the surface of something else are no evidence: when a book is gone, its lower edge still agrees with the
+table. What lies where the earlier visit never looked is neither new nor old: it is added to a map, not reported.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
 from og_pointcloud.journal import with_bar
 from og_pointcloud.mapping.likeness import (
-    ALIKE,
-    FEWEST_SAME,
-    MOST_ROWS,
-    OTHER_COLOR,
+    MAX_COLOR_DIFFERENCE,
+    MAX_COMPARED_DESCRIPTORS,
+    MIN_LIKENESS,
+    MIN_UNMOVED_THINGS,
+    LikenessScale,
     Look,
-    Scale,
     cosines,
     spread_of,
     typical_cosine,
 )
 from og_pointcloud.mapping.map_record import MapRecord
-from og_pointcloud.mapping.presence import FEWEST_POINTS, Evidence, Presence, Visit, tolerance_of
+from og_pointcloud.mapping.presence import MIN_POINTS, Evidence, Presence, Visit, tolerance_of
 from og_pointcloud.rendering.geometry import nearest_in
 
-SAME_SURFACE = 1.5
-"""Spacings within which two visits' points are of one surface."""
-USUAL_COLORS = 3.0
-"""The color of one thing may differ by so many times as much as that of the median thing which has not moved."""
-LEAST_STILL = 0.05
-"""Share of all points looked at, hidden ones among them, that must be where they were: else it is another frame."""
-SMALL_PIECE = 0.5
-"""A piece of less than this share of another's points is small."""
-OTHER_FRAME = 0.5
-"""Share of points measured again or seen through; if more are seen through, the two do not lie in one frame."""
+SAME_SURFACE_SPACINGS = 1.5
+"""Points of two visits within this many spacings lie on one surface."""
+MAX_COLOR_DEVIATIONS = 3.0
+"""The color of one thing may differ by this many times the difference of the median thing that has not moved."""
+MIN_STILL_SHARE = 0.05
+"""Share of all points looked at, including hidden ones, that must be where they were; else the frames differ."""
+SMALL_PIECE_SHARE = 0.5
+"""A piece is small if it has less than this share of the other's points."""
+MAX_THROUGH_SHARE = 0.5
+"""If more than this share of the points measured again or seen through is seen through, the frames differ."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """An instance that stands elsewhere. id: in the earlier cloud. before, after: (3,) float64, the middle of its
-    points then and now, world coordinates. now: its id in the later cloud.
+    """An instance at another place. id: in the earlier cloud. before, after: (3,) float64, the middle of its points
+    then and now, world coordinates. now: its id in the later cloud.
 
     >>> og.Moved(3, np.zeros(3), np.array([1, 0, 2]), 5).to_dict()
     {'id': 3, 'from': [0.0, 0.0, 0.0], 'to': [1, 0, 2]}
@@ -77,7 +77,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class Changes:
-    """gone, unseen: ids of the earlier cloud. new: ids of the later one. moved: what is in both.
+    """gone, unseen: ids of the earlier cloud. new: ids of the later one. moved: in both.
 
     >>> print(og.Changes(gone=(1, 4), new=(7,), moved=(), unseen=()))
     2 gone, 1 new, 0 moved, 0 not seen again
@@ -99,10 +99,10 @@ class Changes:
 
 
 def compare(before: SceneLike, after: SceneLike, *, progress: bool = True) -> Changes:
-    """What changed between two visits to one place, each a labelled cloud as `fit` or a mapper makes it.
+    """Changes between two visits to one place, each a labelled cloud made by `fit` or a mapper.
 
-    Both lie in one world frame. SceneError where they do not seem to, where the later one does not know its cameras
-    (a file of an older version: fit it again), and FeatureSpaceError where their descriptors cannot be compared.
+    Both must lie in one world frame. SceneError if they seem not to, or if the later one does not know its cameras (a
+    file of an older version: fit it again); FeatureSpaceError if their descriptors cannot be compared.
     progress: show bars with the remaining time where stderr is a terminal.
 
     >>> print(og.compare(wall, wall))  # of `fit`'s example
@@ -115,11 +115,10 @@ def compare(before: SceneLike, after: SceneLike, *, progress: bool = True) -> Ch
 
 @dataclass(frozen=True)
 class Comparison:
-    """changes, and what they rest on. evidence: about the earlier visit's points. nearest: for each later point the row
+    """changes, with their evidence. evidence: about the earlier visit's points. nearest: for each later point the row
     of the nearest earlier one, -1 where none lies on its surface. pieces: for instances that came or moved, later id ->
-    later id of the thing that it is a piece of (itself, for one in one piece); gone_pieces: the same by earlier ids,
-    for what moved. back: of those in ``changes.new``, later id -> earlier id of what had left before the earlier visit.
-    """
+    later id of the thing that it is a piece of (itself, if in one piece). gone_pieces: the same by earlier ids, for
+    what moved. back: for those in ``changes.new`` that had left before the earlier visit, later id -> earlier id."""
 
     changes: Changes
     evidence: Evidence
@@ -133,10 +132,10 @@ def compare_visits(
     earlier: Visit, later: Visit, again: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
     *, progress: bool = False,
 ) -> Comparison:  # fmt: skip
-    """What changed, with the evidence. Both visits lie in the local frame of the earlier one. Errors as `compare`.
+    """Changes with their evidence. Both visits lie in the local frame of the earlier one. Errors as `compare`.
 
-    again: (n,) bool each, which of the earlier points the later visit measured again and which it saw through, if that
-    is known already; then all points of the later visit count as seen.
+    again: (n,) bool each, which earlier points the later visit measured again and which it saw through, if already
+    known; then all points of the later visit count as seen.
     """
     a, b = earlier.cloud, later.cloud
     a.space.require(b.space, "later descriptors")
@@ -144,58 +143,60 @@ def compare_visits(
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
     scatter, spacing = max(earlier.surface.scatter, later.surface.scatter), max(a.spacing, b.spacing)
     tolerance = tolerance_of(spacing, scatter)
-    # What the earlier views say of both visits' points.
+    # What the earlier views say about both visits' points.
     views = with_bar(earlier.measured(), "then", len(a.cameras), progress and earlier.depth is None)
-    shown, known = Presence.by(views, tolerance, a.xyz, b.xyz)
+    shown, was_there = Presence.from_views(views, tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
         views = with_bar(earlier.measured(b.cameras), "then", len(b.cameras), progress)
-        (known,) = Presence.by(views, tolerance, b.xyz)
+        (was_there,) = Presence.from_views(views, tolerance, b.xyz)
     shows = np.ones(len(b), bool)
-    left_out = np.zeros(len(a))  # depth images leave nothing out
-    # What the later views say of both; where frames were judged one by one, the map has counted it already.
+    missing = np.zeros(len(a))  # depth images lack no points
+    # What the later views say about both; where frames were judged one by one, the map has counted it already.
     if again is None:
         views = with_bar(later.measured(), "now", len(b.cameras), progress and later.depth is None)
-        asked, own = Presence.by(views, tolerance, a.xyz, b.xyz)
-        _require_one_frame(asked)
-        again, shows = (asked.present, asked.absent), own.present
+        still_there, own = Presence.from_views(views, tolerance, a.xyz, b.xyz)
+        _require_one_frame(still_there)
+        again, shows = (still_there.present, still_there.absent), own.present
         if later.depth is None:
-            left_out = asked.left_out(nearest_in(cKDTree(b.xyz), a.xyz)[0] > spacing)
+            missing = still_there.missing(nearest_in(cKDTree(b.xyz), a.xyz)[0] > spacing)
     distance, nearest = nearest_in(cKDTree(a.xyz), b.xyz)
-    of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance), left_out)
-    not_there = known.left_out(distance > spacing)
-    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance), not_there)
-    return _decide(earlier, later, of_earlier, of_later, np.where(distance <= SAME_SURFACE * a.spacing, nearest, -1))
+    of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.distinct(tolerance), missing)
+    not_there = was_there.missing(distance > spacing)
+    of_later = Evidence(shows, was_there.present, was_there.absent, later.distinct(tolerance), not_there)
+    nearest = np.where(distance <= SAME_SURFACE_SPACINGS * a.spacing, nearest, -1)
+    return _decide(earlier, later, of_earlier, of_later, nearest)
 
 
-def _require_one_frame(asked: Presence) -> None:
+def _require_one_frame(now: Presence) -> None:
     """SceneError where hardly any point that is looked at again is where it was; a warning where none is looked at."""
-    still, through = np.count_nonzero(asked.present), np.count_nonzero(asked.odds < 0)
-    met = np.count_nonzero(asked.hidden | (asked.odds != 0))
-    if through > OTHER_FRAME * (still + through) or still < LEAST_STILL * met:
+    still, through = np.count_nonzero(now.present), np.count_nonzero(now.balance < 0)
+    met = np.count_nonzero(now.hidden | (now.balance != 0))
+    if through > MAX_THROUGH_SHARE * (still + through) or still < MIN_STILL_SHARE * met:
         raise SceneError(
             f"of {met:,} points that the later visit looks at, {still:,} are where they were and {through:,} are seen "
             "through; expected few changes: the two do not lie in one world frame, or are of two places: register "
             "their poses first"
         )
     if not met:
-        what = f"the later visit looks at none of the earlier one's {len(asked.odds):,} points: the two do not overlap"
+        what = f"the later visit looks at none of the earlier one's {len(now.balance):,} points: the two do not overlap"
         warnings.warn(f"{what}, or do not lie in one world frame, so nothing is known of changes", stacklevel=4)
 
 
 @dataclass(frozen=True)
 class _Thing:
-    """One thing that left, or came, as one visit shows it. pieces: its instances, the largest first. look: by those of
-    its points that left, or came; place: of all pieces. points: how many these are. surely: this is no accident."""
+    """One thing that left or came, as one visit shows it. pieces: its instances, the largest first. look: of those of
+    its points that left or came, with the place of all pieces. points: number of these. surely: significant, not
+    chance."""
 
     pieces: tuple[int, ...]
     look: Look
     points: int
     surely: bool
 
-    def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: Scale) -> bool:
-        """Whether another looks like a piece of this one, which then is at that place and so long."""
+    def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: LikenessScale) -> bool:
+        """Whether another looks like a piece of this one, which then is at that place and this long (reach)."""
         near = np.linalg.norm(piece.look.place - place) < reach
-        return bool(near) and self.look.has_color_of(piece.look) and scale.cosine(self.look, piece.look) > ALIKE
+        return bool(near) and self.look.has_color_of(piece.look) and scale.cosine(self.look, piece.look) > MIN_LIKENESS
 
     def with_pieces(self, other: _Thing) -> _Thing:
         """This one with the pieces of another."""
@@ -206,31 +207,31 @@ class _Thing:
         )
 
     def without_pieces(self) -> _Thing:
-        """This one emptied, once another has its pieces; it keeps its place in the list."""
+        """This one emptied, once another has its pieces; it keeps its position in the list."""
         return _Thing((), self.look, 0, False)
 
 
 def _decide(
     earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence, nearest: NDArray[np.int64]
 ) -> Comparison:
-    """The changes by the evidence of either visit. nearest: as in `Comparison`."""
+    """The changes, from the evidence about both visits. nearest: as in `Comparison`."""
     left, left_surely, unseen = of_earlier.decided(earlier)
     came, came_surely, _ = of_later.decided(later)
-    # How alike one thing looks in both visits is learned from what stayed.
-    scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
+    # The similarity of one thing in both visits is learned from what stayed.
+    scale = _likeness_scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
     gone = _things(earlier, left, left_surely, of_earlier.through)
     new = _things(later, came, came_surely, of_later.through)
-    count = len(gone)  # behind them: what an earlier visit found gone, and may be back
+    count = len(gone)  # after them: what an earlier visit found gone and may be back
     gone += [_Thing((k,), look, 0, True) for k, look in MapRecord.of(earlier.cloud).gone.items()]
-    gone, new, pairs = _gathered(gone, new, _matched(gone, new, scale), scale)
-    # What may be missing by chance has left, or come, if it looks like what surely came, or left.
+    gone, new, pairs = _merged_pieces(gone, new, _matched(gone, new, scale), scale)
+    # What may be missing by chance has left (or come) if it looks like something that surely came (or left).
     pairs = {g: n for g, n in pairs.items() if gone[g].surely or new[n].surely}
     gone_alone = [thing for g, thing in enumerate(gone[:count]) if g not in pairs and thing.surely]
     new_alone = [thing for n, thing in enumerate(new) if n not in pairs.values() and thing.surely and thing.pieces]
     gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
     # The earlier map has no point of what is back: it came, and did not move.
     back = {new[n].pieces[0]: gone[g].pieces[0] for g, n in pairs.items() if g >= count}
-    # What only likely left, and looks like nothing that came, may be missing by chance: nothing is known of it.
+    # What only likely left and looks like nothing that came may be missing by chance: it counts as unseen.
     unseen |= left
     unseen[[piece for thing in gone_alone for piece in thing.pieces] + list(gone_pieces)] = False
     changes = Changes(
@@ -242,7 +243,7 @@ def _decide(
             if g < count
         ),
         unseen=tuple(np.flatnonzero(unseen & (earlier.count(earlier.cloud.instance_ids >= 0) > 0)).tolist()),
-    )  # of what left in earlier visits the table has rows without points: these are not unseen
+    )  # what left in earlier visits has rows without points in the table: these are not unseen
     come = [*new_alone, *(new[n] for n in pairs.values())]
     pieces = {piece: thing.pieces[0] for thing in come for piece in thing.pieces}
     return Comparison(changes, of_earlier, nearest, pieces, gone_pieces, back)
@@ -257,82 +258,83 @@ def _unmoved(
         return np.zeros((0, 2), np.int64)
     owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], BACKGROUND)
     stayed = ~np.append(left, [True, True])[owners] & ~np.append(came, [True, True])[later.cloud.instance_ids]
-    shared = later.shared(np.where(stayed, owners, BACKGROUND), len(left))
+    shared = later.overlap(np.where(stayed, owners, BACKGROUND), len(left))
     described = [
         np.isin(np.arange(len(v.cloud.instances)), v.cloud.instances.descriptor_instance) for v in (earlier, later)
     ]
-    # Best partners of each other.
+    # Pairs that are each other's best partner.
     partner, of_later = (np.asarray(shared.argmax(axis=axis)).ravel() for axis in (0, 1))
-    one = np.flatnonzero((shared.max(axis=0).toarray().ravel() >= FEWEST_POINTS) & described[0])
+    one = np.flatnonzero((shared.max(axis=0).toarray().ravel() >= MIN_POINTS) & described[0])
     other = partner[one]
     mutual = (of_later[other] == one) & described[1][other]
     return np.stack([one, other], axis=1)[mutual]
 
 
-def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
-    """What cosines and colors mean, by what has not moved, (m, 2): how alike the two visits show each thing, and how
-    alike it is to the other thing that is most like it."""
+def _likeness_scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> LikenessScale:
+    """Calibration of cosines and colors by what has not moved, (m, 2): the similarity of each thing in the two visits,
+    and to the other thing that is most like it."""
     a, b = earlier.cloud.instances, later.cloud.instances
-    # Adjoining instances may be parts of one thing: they are no other things.
+    # Adjoining instances may be parts of one thing: they do not count as other things.
     adjoining, itself = later.adjoining[unmoved[:, 1]][:, unmoved[:, 1]], np.arange(len(unmoved))
     own, most = np.zeros((2, len(unmoved)))
-    for rows in np.array_split(itself, 1 + len(unmoved) // MOST_ROWS):
+    for rows in np.array_split(itself, 1 + len(unmoved) // MAX_COMPARED_DESCRIPTORS):
         between = cosines(a, unmoved[rows, 0], b, unmoved[:, 1])
         own[rows] = between[rows - rows[:1], rows]
         between[rows - rows[:1], rows] = between[adjoining[rows].nonzero()] = -np.inf
         most[rows] = between.max(axis=1, initial=-np.inf)
     others = most[np.isfinite(most)]
-    if len(others) < FEWEST_SAME:
-        return Scale(other=typical_cosine(b.descriptors, spread_of(b.agreement, b.masks)[b.descriptor_instance]))
+    if len(others) < MIN_UNMOVED_THINGS:
+        spread = spread_of(b.agreement, b.masks)[b.descriptor_instance]
+        return LikenessScale(other=typical_cosine(b.descriptors, spread))
     same, other = float(np.median(own)), float(np.median(others))
     one, two = earlier.cloud.rgb, later.cloud.rgb
     if one is None or two is None:
-        return Scale(same, other)
-    # Other light shifts all colors alike; what is left differs from thing to thing.
+        return LikenessScale(same, other)
+    # Different light shifts all colors alike; the rest differs from thing to thing.
     pairs = ((one[earlier.rows[i]], two[later.rows[k]]) for i, k in unmoved.tolist())
     off = np.array([np.median(now, axis=0) - np.median(was, axis=0) for was, now in pairs])
     shift = np.median(off, axis=0)
     usual = float(np.median(np.abs(off - shift).max(axis=1)))
-    return Scale(same, other, shift, max(OTHER_COLOR, USUAL_COLORS * usual))
+    return LikenessScale(same, other, shift, max(MAX_COLOR_DIFFERENCE, MAX_COLOR_DEVIATIONS * usual))
 
 
 def _things(
     visit: Visit, chosen: NDArray[np.bool_], surely: NDArray[np.bool_], through: NDArray[np.bool_]
 ) -> list[_Thing]:
-    """Chosen instances as things of one piece, each as it looks by its points that left, or came: ``through``."""
+    """Chosen instances as things of one piece, each with the look of its points that left or came: ``through``."""
     rows = {k: visit.rows[k][through[visit.rows[k]]] for k in np.flatnonzero(chosen).tolist()}
     return [_Thing((k,), visit.look(k, of), len(of), bool(surely[k])) for k, of in rows.items()]
 
 
-def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, int]:
-    """Row of gone -> row of new, where the two look like one thing: the assignment that is best as a whole."""
+def _matched(gone: list[_Thing], new: list[_Thing], scale: LikenessScale) -> dict[int, int]:
+    """Row of gone -> row of new where the two look like one thing: the best assignment overall."""
     if not gone or not new:
         return {}
     alike = np.array([[scale.likeness(one.look, other.look) for other in new] for one in gone])
     lengths = [np.array([thing.look.length for thing in things]) for things in (gone, new)]
     as_long = np.minimum.outer(*lengths) / np.maximum(np.maximum.outer(*lengths), 1e-12)
-    # Likeness weighs more, and counts no further once it is as of one thing; among several as alike, which may be
-    # pieces of one thing, the one of the same length is taken.
-    rows, columns = linear_sum_assignment(-np.where(alike > ALIKE, 2 * np.minimum(alike, 1) + as_long, 0))
-    return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}
+    # Likeness weighs more, and is capped at 1, that of one thing: among several as alike, which may be pieces of one
+    # thing, the one of the same length is taken.
+    rows, columns = linear_sum_assignment(-np.where(alike > MIN_LIKENESS, 2 * np.minimum(alike, 1) + as_long, 0))
+    return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > MIN_LIKENESS}
 
 
-def _gathered(
-    gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale
+def _merged_pieces(
+    gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: LikenessScale
 ) -> tuple[list[_Thing], list[_Thing], dict[int, int]]:
-    """Gone, new and pairs after what moved has taken in its other pieces: instances that look like it, have its color,
-    and lie no farther off than it is long. Of those that left, only small ones: a large one that stood beside it may
-    have been another of its kind. Things whose pieces were taken stay in the lists, empty."""
+    """Gone, new and pairs after what moved was merged with its other pieces: instances that look like it, have its
+    color, and lie no farther off than it is long. Of those that left, only small ones: a large one that stood beside it
+    may have been another of its kind. Things whose pieces were merged stay in the lists, empty."""
     gone, new, pairs = list(gone), list(new), dict(pairs)
     within_visit = replace(scale, shift=0.0)
     for g in sorted(pairs, key=lambda g: -gone[g].points):
-        if g not in pairs:  # taken in by a larger one
+        if g not in pairs:  # merged into a larger one
             continue
         n = pairs[g]
         long = max(gone[g].look.length, new[n].look.length)
         for h, piece in enumerate(gone):
             # Where the piece is matched itself, its counterpart must be a piece at the new place.
-            small = h != g and 0 < piece.points < SMALL_PIECE * gone[g].points
+            small = h != g and 0 < piece.points < SMALL_PIECE_SHARE * gone[g].points
             came_too = h not in pairs or gone[g].has(new[pairs[h]], new[n].look.place, long, scale)
             if small and came_too and gone[g].has(piece, gone[g].look.place, long, within_visit):
                 gone[g], gone[h] = gone[g].with_pieces(piece), piece.without_pieces()

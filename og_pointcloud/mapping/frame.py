@@ -1,4 +1,4 @@
-"""A frame: what one posed image brings to a map, checked before anything of the map is touched."""
+"""A frame: the input of one posed image to a map, checked before the map is changed."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera, View, numbers_of
 
-COMPARED = 4000
-"""About how many points of the map a frame's depth is compared with."""
-FEWEST_COMPARED = 200
-"""Fewer say nothing: the frame looks at a part of the place that the map does not know."""
-CELLS, FRONT = 16, 1.2
-"""Cells of an image along each side; a point more than FRONT times as far as the nearest one of its cell may be hidden
-by it."""
-LEAST_AGREEING = 0.25
-"""Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
-OTHER_UNIT = 2.5
-"""Factor between measured and expected depths from which on it is another unit of length: feet are 3.3 to a meter."""
-UNIT_SPREAD = 1.2
-"""In another unit all depths are off by one factor: three quarters of the ratios span less than this times it."""
+COMPARED_POINTS = 4000
+"""Approximate number of map points that a frame's depth is compared with."""
+MIN_COMPARED_POINTS = 200
+"""With fewer there is no check: the frame looks at a part of the place that the map does not know."""
+GRID_CELLS, MAX_DEPTH_RATIO = 16, 1.2
+"""Cells of an image along each side; a point more than MAX_DEPTH_RATIO times as far as the nearest one of its cell may
+be hidden by it."""
+MIN_AGREEING_SHARE = 0.25
+"""Share of the map points in front of a camera whose depth it must confirm: only a small part of a place moves."""
+OTHER_UNIT_RATIO = 2.5
+"""Ratio of measured to expected depths above which the unit of length differs: a meter is 3.3 feet."""
+MAX_RATIO_SPREAD = 1.2
+"""In another unit all depths are off by one factor: three quarters of the ratios span less than this times their
+median."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One posed image of a stream. Everything but the camera may be missing.
 
-    camera: world_to_camera from world coordinates (not a scene's local ones). None is refused: without a pose nothing
-    can be placed.
-    masks: (H, W) int, -1 outside of masks (or NOT_SEEN, as of `View`), else a row of features; H, W the camera's.
-    features: (M, D) float, one row a mask, as the encoder gave it.
-    depth: (H, W) along the optical axis, as sparse as it is: float, world lengths, 0 or NaN where nothing was measured;
-    or whole numbers, millimeters of a world in meters, as depth images hold them (`formats.depth.lengths`).
-    cloud: (n, 3) float, world coordinates, or any cloud that `og.segment` takes, measured from this camera's place, in
-    place of depth.
+    camera: world_to_camera from world coordinates (not a scene's local ones). None is refused: nothing can be placed
+    without a pose.
+    masks: (H, W) int, -1 outside of masks (or NOT_SEEN, as in `View`), else a row of features; H, W the camera's.
+    features: (M, D) float, one row per mask, as the encoder gave it.
+    depth: (H, W) along the optical axis, possibly sparse: float in world units, 0 or NaN where nothing was measured; or
+    integers, millimeters of a world in meters, as in depth images (`formats.depth.lengths`).
+    cloud: (n, 3) float, world coordinates, or any cloud that `og.segment` takes, measured from this camera's position,
+    instead of depth.
     rgb: (H, W, 3) uint8. stamp: seconds, or any count that grows with time; None: one more than the last frame's.
-    feature_space: name of the features' encoder, which must be the map's; None: it is not said.
+    feature_space: name of the features' encoder, which must be the map's; None: not stated.
 
     >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
     >>> frame = og.Frame(camera, masks=np.full((48, 64), -1), stamp=12.5)
@@ -64,8 +65,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class CheckedFrame:
-    """A frame that passed all checks. camera: its pose from the map's local frame. ids: (H, W) int32 mask image, -1
-    none. features: (M, D) float32. view: what its depth measures, None without any. rgb: (H, W, 3) uint8 or None."""
+    """A frame that passed all checks. camera: pose from the map's local frame. ids: (H, W) int32 mask image, -1 none.
+    features: (M, D) float32. view: surfaces measured by its depth, None without. rgb: (H, W, 3) uint8 or None."""
 
     camera: Camera
     ids: NDArray[np.int32]
@@ -78,7 +79,7 @@ class CheckedFrame:
 def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stamp: float) -> CheckedFrame:
     """The frame in a map's local frame (world = local + origin). SceneError, or FeatureSpaceError, says what is wrong.
 
-    space: of the map's descriptors, width 0 while it has none. stamp: for a frame without one.
+    space: of the map's descriptors, of width 0 while it has none. stamp: for a frame without one.
     """
     if not isinstance(frame, Frame):
         raise SceneError(f"a frame is a {type(frame).__name__}; expected an og.Frame")
@@ -105,7 +106,7 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
 
 
 def in_arrays(frame: Frame) -> Frame:
-    """A frame with plain arrays for whatever it was given as: tensors, lists, clouds."""
+    """The frame with plain arrays instead of tensors, lists and clouds."""
     given = {name: getattr(frame, name) for name in ("masks", "features", "depth", "rgb")}
     arrays = {name: numbers_of(value) for name, value in given.items() if value is not None}
     return replace(frame, **arrays, cloud=None if frame.cloud is None else world_points(frame.cloud))
@@ -128,12 +129,12 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
                 f"{name}: masks are {ids.dtype} {ids.shape}; expected whole numbers ({camera.height}, {camera.width}): "
                 "rows of features, -1 outside of masks"
             )
-    view = View(name, camera, ids, features)  # which checks sizes, ids and finite rows
+    view = View(name, camera, ids, features)  # checks sizes, ids and finite rows
     return np.maximum(view.mask_map(), -1), features
 
 
 def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str) -> NDArray[np.float32]:
-    """(H, W), 0 where nothing was measured; of a cloud the nearest point in each pixel."""
+    """(H, W), 0 where nothing was measured; for a cloud, the nearest point in each pixel."""
     depth = np.zeros((camera.height, camera.width), np.float32) if frame.depth is None else numbers_of(frame.depth)
     if depth.shape != (camera.height, camera.width) or depth.dtype.kind not in "fiu":
         raise SceneError(
@@ -151,29 +152,28 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
 
 
 def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], tolerance: float) -> None:
-    """SceneError where a frame's depth contradicts nearly all of the map's points before it: pose or unit are wrong.
+    """SceneError if a frame's depth contradicts nearly all map points in front of it: its pose or unit is wrong.
 
-    xyz: (n, 3) points of the map near the frame, some of them hidden by others. tolerance: as of `states_of_points`.
-    What moves is a small part of a place; a pose that is off moves all of it. A frame that hardly meets the map is let
-    through.
+    xyz: (n, 3) points of the map near the frame, some of them hidden by others. tolerance: as in `states_of_points`.
+    Only a small part of a place moves, but a wrong pose moves all of it. A frame that hardly meets the map passes.
     """
     uv_px, z = view.camera.project(xyz)
     inside = view.camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
     measured, z = view.depth[row, column], z[inside]
-    # Points that the map itself hides say nothing: before a camera close to a wall, most of the place is behind it.
-    cell = row * CELLS // view.camera.height * CELLS + column * CELLS // view.camera.width
-    nearest = np.full(CELLS**2, np.inf)
+    # Points that the map itself hides are no evidence: for a camera close to a wall, most of the place is behind it.
+    cell = row * GRID_CELLS // view.camera.height * GRID_CELLS + column * GRID_CELLS // view.camera.width
+    nearest = np.full(GRID_CELLS**2, np.inf)
     np.minimum.at(nearest, cell, z)
-    met = (measured > 0) & (z < FRONT * nearest[cell])
-    if np.count_nonzero(met) < FEWEST_COMPARED:
+    met = (measured > 0) & (z < MAX_DEPTH_RATIO * nearest[cell])
+    if np.count_nonzero(met) < MIN_COMPARED_POINTS:
         return
     agreeing = float((states_of_points(xyz[inside][met], tolerance, view) == AGREES).mean())
-    if agreeing >= LEAST_AGREEING:
+    if agreeing >= MIN_AGREEING_SHARE:
         return
-    # One factor off nearly everywhere is another unit of length; anything else cannot be told apart.
+    # The same factor nearly everywhere means another unit of length; other causes cannot be told apart.
     low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])
-    if high - low < UNIT_SPREAD * middle and max(middle, 1 / middle) > OTHER_UNIT:
+    if high - low < MAX_RATIO_SPREAD * middle and max(middle, 1 / middle) > OTHER_UNIT_RATIO:
         what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
     else:
         what = (
@@ -182,5 +182,5 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
         )
     raise SceneError(
         f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; expected "
-        f"at least {LEAST_AGREEING:.0%}: {what}"
+        f"at least {MIN_AGREEING_SHARE:.0%}: {what}"
     )

@@ -1,4 +1,4 @@
-"""Frames from a sensor that waits for nobody: put never blocks; frames that get too old are dropped, and reported."""
+"""Frames from a sensor that does not wait: put never blocks; frames that get too old are dropped and reported."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from og_pointcloud.mapping.mapper import FrameChange, Mapper
 
 
 class FrameQueue:
-    """Feeds a mapper in a thread of its own, in the order in which frames come.
+    """Feeds a mapper in its own thread, in order of arrival.
 
-    max_age: seconds that a frame may wait. on_change: called, in that thread, with each frame's change. on_drop: called
-    with a message for each frame that was dropped, for its age or because it was refused, and where on_change fails;
-    None: a warning. lock: held while a frame goes in; hold it to use the mapper, or to put another in its place.
+    max_age: seconds that a frame may wait. on_change: called in that thread with each frame's change. on_drop: called
+    with a message for each frame that was dropped, because of its age or because it was refused, and if on_change
+    fails; None: a warning. lock: held while a frame is integrated; hold it to use or replace the mapper.
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class FrameQueue:
 
     def put(self, frame: Frame) -> None:
         """Hand a frame over; returns at once. It is copied: a driver may write into its arrays again."""
-        with suppress(Exception):  # what is no frame of arrays is refused, and told, in its turn
+        with suppress(Exception):  # anything but a frame of arrays is refused, and reported, in its turn
             frame = deepcopy(in_arrays(frame))
         self._waiting.put((time.monotonic(), frame))
 
     def close(self) -> None:
-        """Work off what waits and is young enough, and end the thread."""
+        """Process the waiting frames that are not too old, and end the thread."""
         self._waiting.put(None)
         self._thread.join()
 
@@ -54,7 +54,7 @@ class FrameQueue:
         while (waiting := self._waiting.get()) is not None:  # None: `close` asks for the end
             try:
                 self._take(*waiting)
-            except Exception:  # of on_drop: nobody is left to be told, and the thread lives on
+            except Exception:  # of on_drop: there is nobody left to report to, and the thread lives on
                 traceback.print_exc()
 
     def _take(self, arrived: float, frame: Frame) -> None:

@@ -1,7 +1,7 @@
-"""All that a growing map holds: its points, whether they are still there, what they voted for, what views showed.
+"""The state of a growing map: its points, whether they are still there, their votes, and what views showed.
 
-Which points a frame shows, and in which of its masks, follows from its depth or, without one, from the map's own
-surface: points that lie behind it are hidden.
+Which points a frame shows, and in which of its masks, follows from its depth or, without depth, from the map's own
+surface: points behind it are hidden.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Camera, Points, numbers_of
 from og_pointcloud.settings import GeometrySettings
 
-MARGIN = 0.1
-"""Points are drawn up to this share of the image beyond its border, as they may hide others within."""
+MARGIN_SHARE = 0.1
+"""Points up to this share of the image beyond its border are drawn, as they may hide others within."""
 READINGS_PER_SPACING = 1.5
-"""Readings that a frame gives to the map per spacing, along each image axis: more would only be averaged."""
-MOST_ODDS = 3.0
-"""Frames that a point's history counts for at most, for it or against it."""
+"""Depth readings of a frame used per spacing, along each image axis: more would only be averaged."""
+MAX_BALANCE = 3.0
+"""A point's history counts as at most this many frames, for it or against it."""
 RECENT_FRAMES = 4096
-"""Stamps of frames that are remembered: they tell since when an object stands where it is."""
+"""Number of latest frames whose stamps are kept: they tell since when an object has been where it is."""
 
 
 @dataclass
 class GrowingMap:
-    """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought points. sequence: number
-    of the next frame; 0 stands for what was known before the first. stamp: the latest of all frames; recent: those of
-    the last RECENT_FRAMES, in the order of their coming. spacing: of each of the first rows, the points known from the
-    beginning. scale: how large points are drawn for frames without depth, in spacings; None: not chosen yet. drawn: how
-    many such frames were kept when it was chosen."""
+    """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that added points. sequence: number
+    of the next frame; 0 stands for what was known before the first. stamp: the latest of all frames. recent: stamps of
+    the last RECENT_FRAMES frames, in order of arrival. spacing: of each of the first rows, the points known at the
+    start. scale: size of points drawn for frames without depth, in spacings; None: not chosen yet. drawn: number of
+    such frames kept when it was chosen."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
@@ -72,35 +72,36 @@ class GrowingMap:
     ) -> GrowingMap:  # fmt: skip
         """A map without points. grows: whether frames add some. scatter: standard deviation of points off their
         surface."""
-        presence = Presence(tolerance_of(spacing, scatter), MOST_ODDS)
+        presence = Presence(tolerance_of(spacing, scatter), MAX_BALANCE)
         return cls(origin, space, VoxelPoints(spacing, grows), presence)
 
     def grow(self) -> None:
-        """Make room for what is known of each point."""
+        """Allocate all per-point arrays up to the number of points."""
         for columns in (self.presence, self.votes, self.kept):
             columns.grow(self.points.n)
 
-    def about(self, camera: Camera, margin: float = 0.0, most: int = 1 << 31) -> NDArray[np.int32]:
-        """Rows of the points that are there and may fall into an image, or within a share ``margin`` beyond its border.
-        Where these are more than ``most``, at most so many of them, evenly chosen."""
-        rows = self.points.packets.before(camera, self.points.edge, margin=margin)
+    def rows_in_view(self, camera: Camera, margin: float = 0.0, most: int = 1 << 31) -> NDArray[np.int32]:
+        """Rows of the points that are there and may project into an image, or within a share ``margin`` beyond its
+        border; at most ``most`` of them, evenly chosen."""
+        rows = self.points.packets.in_view(camera, self.points.edge, margin=margin)
         rows = rows[:: 1 + len(rows) // most]
         return rows[self.points.weight[rows] > 0]
 
     def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
-        """(m,) spacing of points; for those that frames brought it is the edge of a voxel."""
+        """(m,) spacing of points; the voxel edge for those that frames added."""
         return np.append(self.spacing, np.float32(self.points.edge))[np.minimum(rows, len(self.spacing))]
 
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Count what a view measures for and against points; rows of those that it confirms, and of those that must
-        leave after it."""
+        """Count a view's measurements for and against points. Returns the rows of those that it confirms, and of those
+        to be removed after it."""
         presence, points = self.presence, self.points
-        rows = self.about(view.camera)
+        rows = self.rows_in_view(view.camera)
         states = states_of_points(points.xyz[rows], presence.tolerance, view)
-        presence.take(rows, points.xyz, states, view.camera.center, stamp)
-        # Two frames more see through a point than confirm it, and they look from two places: one alone removes nothing.
+        presence.add_states(rows, points.xyz, states, view.camera.center, stamp)
+        # At least two more frames see through a point than confirm it, from two places: one alone removes nothing.
         through = rows[states == THROUGH]
-        return rows[states == AGREES], through[(presence.odds[through] < -1) & (presence.refuted[through] > 1)]
+        refuted = (presence.balance[through] < -1) & (presence.through_directions[through] > 1)
+        return rows[states == AGREES], through[refuted]
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
         """Add the readings of a frame, thinned to the map's density and without flying pixels, which lie between two
@@ -122,7 +123,7 @@ class GrowingMap:
             self.anchors.append((frame.stamp, frame.camera.world_to_camera))
         added = np.arange(before, points.n, dtype=np.int32)
         self.grow()
-        self.presence.odds[added], self.presence.seen_at[added] = 1, frame.stamp
+        self.presence.balance[added], self.presence.seen_at[added] = 1, frame.stamp
         self.kept.born[added] = self.sequence
         return added
 
@@ -132,24 +133,24 @@ class GrowingMap:
         return np.where(self.points.alive, self.votes.best(everyone, self.tracks.root), NO_TRACK)
 
     def rows_of(self, track: int) -> NDArray[np.int32]:
-        """Rows of the points of a track; only packets about the track's box are gone through."""
+        """Rows of the points of a track; only packets that meet the track's box are searched."""
         (low, high), edge = self.tracks.tracks[track].box, self.points.edge
-        rows = self.points.packets.within(low - edge, high + edge)
+        rows = self.points.packets.in_box(low - edge, high + edge)
         return rows[(self.points.weight[rows] > 0) & (self.votes.best(rows, self.tracks.root) == track)]
 
     def forget(self, rows: NDArray[np.int32]) -> None:
-        """Forget the votes and the evidence of points that left, or whose object left; from this frame on they may
-        belong to something else."""
+        """Reset the votes and evidence of points that left, or whose object left; from this frame on they may belong to
+        something else."""
         self.votes.track[rows], self.votes.weight[rows] = NO_TRACK, 0
-        self.presence.odds[rows], self.presence.refuted[rows] = 0, 0
+        self.presence.balance[rows], self.presence.through_directions[rows] = 0, 0
         self.kept.born[rows] = self.sequence
 
     def place_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """(3,) middle of points, world coordinates: the median, as votes give an object some points far off it."""
+        """(3,) middle of points, world coordinates: the median, as votes assign some far-off points to an object."""
         return np.median(self.points.xyz[rows].astype(np.float64), axis=0) + self.origin
 
     def checked_poses(self, poses: Mapping[float, ArrayLike]) -> dict[float, Camera]:
-        """Stamp -> a camera with the corrected world_to_camera of that frame. SceneError or a warning as
+        """Stamp -> a camera with the corrected world_to_camera of that frame. SceneError or a warning as in
         `Mapper.correct`."""
         if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
             raise SceneError(f"a pose is of frame {strange[0]!r}; expected the frame's stamp, a number")
@@ -158,7 +159,7 @@ class GrowingMap:
         return cameras
 
     def correct(self, cameras: Mapping[float, Camera]) -> None:
-        """Move what the frames of these stamps brought. cameras: of `checked_poses`."""
+        """Move the points that the frames of these stamps added. cameras: from `checked_poses`."""
         corrected = {stamp: in_local_frame(camera, self.origin).world_to_camera for stamp, camera in cameras.items()}
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:
@@ -171,19 +172,19 @@ class GrowingMap:
             if view.stamp in corrected:
                 camera = replace(view.camera, world_to_camera=corrected[view.stamp])
                 self.kept.views[index] = replace(view, camera=camera)
-        self.points.refile()
+        self.points.reindex()
         for heaviest in self.votes.track[: self.points.n].T:
-            self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
-        # Snapshots are remembered by the sequence: they are made anew after a correction.
+            self.tracks.extend_boxes(self.points.xyz, np.arange(self.points.n), heaviest)
+        # Snapshots are cached by sequence: they are made again after a correction.
         self.count(self.stamp)
 
     @property
     def remembered_since(self) -> float:
-        """Of frames before this stamp only some are remembered."""
+        """Not all frames before this stamp are remembered."""
         return min(self.recent) if len(self.recent) == RECENT_FRAMES else -np.inf
 
     def _warn_of_strange(self, stamps: Collection[float]) -> None:
-        """Warn of stamps of no frame, or, where all are such, SceneError: seconds were taken for nanoseconds, say."""
+        """Warn of stamps that belong to no frame; SceneError if all do: seconds instead of nanoseconds, say."""
         known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
         strange = [stamp for stamp in stamps if stamp not in known and stamp >= self.remembered_since]
         some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
@@ -200,16 +201,16 @@ class GrowingMap:
         self.recent = [*self.recent[1 - RECENT_FRAMES :], stamp]
 
     def stamp_of(self, sequence: int) -> float:
-        """The stamp of the frame of that number, or of the earliest that is remembered; -inf for what was known before
-        all frames."""
+        """The stamp of the frame of that number, or of the earliest remembered one; -inf for what was known before all
+        frames."""
         place = sequence - (self.sequence - len(self.recent))  # the last of recent is number sequence - 1
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Points in one frame. rows: (m,) int32 of the points that were looked for. found: which of these are seen, by
-    place in ``rows``. mask: (s,) id at the pixel of each seen one, -1 none."""
+    """Points in one frame. rows: (m,) int32 candidate points. found: which of these are seen, by index into ``rows``.
+    mask: (s,) id at the pixel of each seen point, -1 none."""
 
     rows: NDArray[np.int32]
     found: Sightings
@@ -217,20 +218,20 @@ class Seen:
 
     @property
     def points(self) -> NDArray[np.int32]:
-        """(s,) rows of those that are seen."""
+        """(s,) rows of the points that are seen."""
         return self.rows[self.found.openness.indices]
 
 
 def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int32]) -> Seen:
-    """Of the points that a frame's depth measured, those in its image; all are fully open, as they were measured."""
+    """The points in a frame's image among those that its depth measured; as they were measured, all are fully open."""
     uv_px, _ = frame.camera.project(known.points.xyz[rows])
     inside = frame.camera.shows(uv_px)
     return _seen(frame, rows[inside], np.ones(np.count_nonzero(inside), np.float32), uv_px[inside])
 
 
 def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
-    """The points that a frame without depth sees: those that the map's own points, drawn as `fit` does, do not hide."""
-    camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
+    """The points that a frame without depth sees: those not hidden by the map's own points, drawn as in `fit`."""
+    camera, rows = frame.camera, np.sort(known.rows_in_view(frame.camera, MARGIN_SHARE))
     xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
     depth = depths(xyz, camera)
@@ -250,10 +251,9 @@ def _seen(
 
 
 def vote(frame: CheckedFrame, known: GrowingMap, seen: Seen) -> tuple[list[int], list[int]]:
-    """Take in the frame's masks: for now as votes of points and witnesses of tracks, for later as rows of the mask
-    table.
+    """Count the frame's masks: for now as votes of points and witnesses of tracks, for later as rows of the mask table.
 
-    Returns the tracks that are objects now and want an id, and those with one that were seen again.
+    Returns the tracks that are now objects and need an id, and those with an id that were seen again.
     """
     known.space = replace(known.space, width=frame.features.shape[1])  # not known before the first mask
     points, seen_at = seen.points, known.presence.seen_at

@@ -1,4 +1,4 @@
-"""Kept views of a map -> a labelled cloud, by the rule of `fit` in mode grouping: the same masks, witnesses, votes."""
+"""Kept views of a map -> a labelled cloud, as `fit` in mode grouping: the same masks, witnesses and votes."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 
 
-def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, settings: FitSettings) -> LabelledCloud:
-    """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighborhood."""
-    # Where each of the map's rows stands among the points to label, -1 for those that are left out.
-    place = np.full(known.points.n, -1, np.int32)
+def labelled(map_: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, settings: FitSettings) -> LabelledCloud:
+    """Some of a map's points, rows (n,), labelled by `fit`'s rule from the kept views. around: their neighborhood."""
+    # Index of each map row among the points to label, -1 for those left out.
+    place = np.full(map_.points.n, -1, np.int32)
     place[rows] = np.arange(len(rows), dtype=np.int32)
-    points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
+    points = Points(map_.points.xyz[rows], map_.origin, map_.points.rgb[rows].astype(np.uint8))
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
-    # First, as it may see the frames without depth anew: the table is made of what they see.
+    # First, as it may update what the frames without depth see, which the table is made of.
     spacing = drawn_spacing(points.xyz, around)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), settings.geometry)
-    _choose_scale(known, points, spacing, thickness, settings, journal)
-    table = known.kept.table(place, len(rows))
+    _choose_scale(map_, points, spacing, thickness, settings, journal)
+    table = map_.kept.table(place, len(rows))
     # The table holds all that the masks say; the scene's views are there for their cameras.
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
     no_feature = np.zeros((0, width), np.float32)
-    kept = zip(table.names, known.kept.views, strict=True)
+    kept = zip(table.names, map_.kept.views, strict=True)
     views = tuple(View(name, view.camera, no_mask, no_feature) for name, view in kept)
-    scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
-    drawn = isotropic(points, spacing, known.scale or geometry.middle_scale, geometry.opacity)
+    scene, geometry = Scene(points, views, map_.space.name, "map"), settings.geometry
+    drawn = isotropic(points, spacing, map_.scale or geometry.middle_scale, geometry.opacity)
     near = near_plane(points.xyz, (view.camera for view in views))
     surface = Surface(scene, None, around, drawn, near, thickness, 1, by_sight=True)
     table = front_surfaces(surface, table, settings, journal)
@@ -46,40 +46,40 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, s
 
 
 def _choose_scale(
-    known: GrowingMap,
+    map_: GrowingMap,
     points: Points,
     spacing: NDArray[np.float32],
     thickness: NDArray[np.float32],
     settings: FitSettings,
     journal: Journal,
 ) -> None:
-    """Choose how large points are drawn, as `fit` does, by the kept views that had no depth; where that is another size
-    than before, find anew what these see."""
-    kept = known.kept.views
+    """Choose the size that points are drawn with, as `fit` does, from the kept views without depth. If it changes,
+    compute again what these views see."""
+    kept = map_.kept.views
     drawn = [k for k, view in enumerate(kept) if len(view.packed)]
-    if len(drawn) == known.drawn:  # no view more than last time
+    if len(drawn) == map_.drawn:  # no view more than last time
         return
     views = [View(f"{k:09d}", kept[k].camera, kept[k].masks, kept[k].features) for k in drawn]
     near = near_plane(points.xyz, (view.camera for view in views))
     scale = choose_scale(points, spacing, thickness, views, near, settings, journal).scale
-    known.drawn, before, known.scale = len(drawn), known.scale or settings.geometry.middle_scale, scale
+    map_.drawn, before, map_.scale = len(drawn), map_.scale or settings.geometry.middle_scale, scale
     for k in drawn if scale != before else ():
         view = kept[k]
         frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp)
-        seen = drawn_points(frame, known, settings.geometry)
+        seen = drawn_points(frame, map_, settings.geometry)
         kept[k] = KeptView.of(frame, view.sequence, seen.found, seen.rows)
 
 
 def matched_ids(
     ids: NDArray[np.int32], count: int, known: NDArray[np.int32], known_count: int
 ) -> tuple[NDArray[np.int64], int]:
-    """(count,) the id that each instance gets, and how many ids there are then: the id of the known object with which
-    it shares most points, each given once; the others get fresh ones from known_count on.
+    """(count,) id of each instance, and the number of ids afterwards. An instance gets the id of the known object with
+    which it shares most points, each given once; the others get fresh ids from known_count on.
 
     ids, known: (n,) instance and known object of each point, below 0 none.
     """
     wanted = np.full(count, -1, np.int64)
-    # Pairs as one number each, the largest overlap first.
+    # Each pair encoded as one number, the largest overlap first.
     both = (ids >= 0) & (known >= 0)
     pairs, shared = np.unique(ids[both].astype(np.int64) * known_count + known[both], return_counts=True)
     for pair in pairs[np.lexsort((pairs, -shared))].tolist():
@@ -95,13 +95,13 @@ def with_ids(cloud: LabelledCloud, wanted: NDArray[np.int64], count: int) -> Lab
     """The cloud with instance k called wanted[k], in a table of ``count`` rows; rows without an instance are empty."""
     table, empty = cloud.instances, {"coarse": -1, "part_of": -1, "reliability": np.nan}
     columns = {}
-    for entry in fields(InstanceTable)[2:]:  # all but the descriptors and whose they are
+    for entry in fields(InstanceTable)[2:]:  # all but the descriptors and their owners
         rows = getattr(table, entry.name)
         columns[entry.name] = np.full(count, empty.get(entry.name, 0), rows.dtype)
         columns[entry.name][wanted] = rows
     number = np.append(wanted, [-2, -1])  # states -2 and -1 index the last two
     columns["part_of"][wanted] = np.where(table.part_of >= 0, number[table.part_of], -1)
-    # Rows of descriptors stay in the order of the instances they are of.
+    # Rows of descriptors stay in the order of their instances.
     owner = wanted[table.descriptor_instance]
     order = np.argsort(owner, kind="stable")
     renamed = InstanceTable(table.descriptors[order], owner[order].astype(np.int32), **columns)

@@ -1,11 +1,11 @@
 """A map on disk while it grows: a kill -9 at any moment loses at most the frame being integrated.
 
-The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each change is
-appended with its number: a frame, a correction, or the next id after those that a snapshot gave; a torn last one is cut
-off. ``map.state`` is the whole map at some number, replaced in one step; the log then begins anew. A mapper that is
-started with the folder reads the state and makes the changes of the log again: this gives the very map that was left,
-and the space on disk grows with the map, not with time. Nothing is pickled: a record is a tree of plain values and of
-the dataclasses named in KINDS, as JSON, and the arrays in it, as .npy.
+The folder holds two files of records, each record with its length and checksum. Each change is appended to
+``frames.log`` with its number: a frame, a correction, or the next id after those that a snapshot gave; a torn last one
+is cut off. ``map.state`` is the whole map at some number, replaced atomically; the log then starts empty. A mapper that
+is started with the folder reads the state and replays the log: this restores the map exactly, and the space on disk
+grows with the map, not with time. Nothing is pickled: a record is a tree of plain values and of the dataclasses in
+RECORD_TYPES as JSON, with its arrays as .npy.
 """
 
 from __future__ import annotations
@@ -41,55 +41,55 @@ from og_pointcloud.mapping.tracks import PointVotes, Track, Tracks
 from og_pointcloud.mapping.voxels import Packets, VoxelHash, VoxelPoints
 from og_pointcloud.scene import Camera
 
-KINDS = {
+RECORD_TYPES = {
     kind.__name__: kind
     for kind in (
         Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Look, Packets, PointVotes, Presence, Track,
         Tracks, VoxelHash, VoxelPoints,
     )
 }  # fmt: skip
-"""Dataclasses that a record may hold, by name: nothing else is ever made from a file."""
-HEAD = struct.Struct("<4sQI")
-"""Of a record: MAGIC, bytes that follow, and their CRC-32."""
+"""Dataclasses that a record may hold, by name: nothing else is ever constructed from a file."""
+RECORD_HEADER = struct.Struct("<4sQI")
+"""MAGIC, number of bytes that follow, and their CRC-32."""
 MAGIC = b"OGF3"
 LOG, STATE = "frames.log", "map.state"
-LOG_BYTES = 1 << 27
-"""Bytes of changes after which the whole map is written and the log begins anew."""
+MAX_LOG_BYTES = 1 << 27
+"""Size of the log above which the whole map is written and the log starts empty."""
 
 
 Poses = dict[float, NDArray[np.float64]]
 """A correction: stamp -> world_to_camera (4, 4)."""
 
 
-_OPEN: WeakValueDictionary[Path, MapJournal] = WeakValueDictionary()
+_OPEN_JOURNALS: WeakValueDictionary[Path, MapJournal] = WeakValueDictionary()
 """The journals of this process."""
 
 
 def holds_map(folder: Path) -> bool:
-    """Whether a path is a folder with nothing in it but what a journal, also one that was killed, leaves."""
+    """Whether a path is a folder with nothing but files of a journal, including one that was killed."""
     ours = LOG, STATE, f".{LOG}", f".{STATE}", LOCK  # with a dot: being written
     return folder.is_dir() and all(file.name.startswith(ours) for file in folder.iterdir())
 
 
 class MapJournal:
-    """The folder of one map. OgPointcloudError where it cannot be written, holds the map of something else, or is
-    another process's; within one process, whoever opened it last has it.
+    """The folder of one map. OgPointcloudError if it cannot be written, holds a map of something else, or is in use by
+    another process; within one process, the last one to open it owns it.
 
-    origin: what the map began with, in words; a folder that was begun with something else is refused.
+    origin: description of what the map began with; a folder that began with something else is refused.
     """
 
     def __init__(self, folder: str | os.PathLike[str], origin: str) -> None:
         self.folder = Path(folder)
         self._log, self._state, self._origin = self.folder / LOG, self.folder / STATE, origin
         self._file: io.FileIO | None = None
-        if earlier := _OPEN.pop(self.folder.resolve(), None):
+        if earlier := _OPEN_JOURNALS.pop(self.folder.resolve(), None):
             earlier._lock.close()
         self._lock = ExitStack()
         self._lock.enter_context(locked(self.folder))
-        _OPEN[self.folder.resolve()] = self
+        _OPEN_JOURNALS[self.folder.resolve()] = self
 
     def state(self) -> GrowingMap | None:
-        """The last whole map; None where there is none yet."""
+        """The last whole map; None if there is none yet."""
         if not self._state.is_file():
             return None
         with self._state.open("rb") as file:
@@ -97,62 +97,62 @@ class MapJournal:
         content = None if record is None else unpacked(record, str(self._state))
         if not (isinstance(content, tuple) and len(content) == 2 and isinstance(content[1], GrowingMap)):
             raise OgPointcloudError(f"{self._state} is damaged, or another version's: remove the folder and map again")
-        began_with, known = content
+        began_with, map_ = content
         if began_with != self._origin:
             raise OgPointcloudError(
                 f"{self.folder} holds a map that began with {began_with}, not with {self._origin}: give that, or "
                 "another folder"
             )
-        return known
+        return map_
 
     def changes(self) -> Iterator[tuple[int, Frame | Poses | int]]:
-        """The changes in the log, in their order, with their numbers: those below the map's own are in it already, as
-        after a kill between the two files. A torn one at the end is cut off, so that new ones follow whole ones."""
+        """The changes in the log, in order, with their numbers: those below the map's own are in it already, if it was
+        killed between the two writes. A torn one at the end is cut off, so that new ones follow whole ones."""
         if not self._log.is_file():
             return
-        whole = 0
+        intact = 0  # bytes of whole records
         with self._log.open("rb") as file:
-            # It is about to be cut and written to: not through a link, and not if it is a file of something else.
+            # The file is about to be truncated and written: refuse a link, or a file of something else.
             if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
                 raise OgPointcloudError(
                     f"{self._log} was not written by a map of this version: it is left as it is; give another folder"
                 )
             while record := _next_record(file):
-                whole = file.tell()
+                intact = file.tell()
                 entry = unpacked(record, str(self._log))
                 if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], int)):
                     raise OgPointcloudError(f"{self._log} is damaged: remove the folder and map again")
                 yield entry
-        if whole < self._log.stat().st_size:
-            os.truncate(self._log, whole)
+        if intact < self._log.stat().st_size:
+            os.truncate(self._log, intact)
 
     def append(self, number: int, change: Frame | Poses | int) -> None:
-        """Write a change behind the others. Where that fails, as on a full disk, the log stays as it was."""
+        """Append a change. If that fails, as on a full disk, the log stays as it was."""
         if isinstance(change, Frame):
             change = in_arrays(change)
             if change.masks is not None and change.masks.max(initial=0) < 1 << 15:
                 change = replace(change, masks=change.masks.astype(np.int16))
-        if _OPEN.get(self.folder.resolve()) is not self:
+        if _OPEN_JOURNALS.get(self.folder.resolve()) is not self:
             raise OgPointcloudError(f"another mapper has gone on with '{self.folder}': this one cannot write there")
         record = _record((number, change))
         with naming(self.folder):
             self._file = self._file or self._log.open("ab", buffering=0)
-            whole = self._file.seek(0, os.SEEK_END)  # a write that failed has moved its place
+            intact = self._file.seek(0, os.SEEK_END)  # a failed write has moved the position
             try:
                 if self._file.write(record) < len(record):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             except OSError:
-                self._file.truncate(whole)  # what is written later would lie behind a torn record, and be lost with it
+                self._file.truncate(intact)  # later records behind a torn one would be lost with it
                 raise
 
-    def settle(self, known: GrowingMap) -> None:
-        """Once the log is long, write the map that it led to, and begin the log anew. Where that fails, as on a full
-        disk, the log goes on: it has all changes."""
-        if self._file is None or self._file.tell() <= LOG_BYTES:
+    def compact(self, map_: GrowingMap) -> None:
+        """Once the log is long, write the map that it led to and empty the log. If that fails, as on a full disk, the
+        log keeps growing: it has all changes."""
+        if self._file is None or self._file.tell() <= MAX_LOG_BYTES:
             return
         try:
             with replacing(self._state) as file:
-                file.write(_record((self._origin, known)))
+                file.write(_record((self._origin, map_)))
         except OSError as error:
             what = f"{self._state} cannot be written ({error.strerror}): its log of changes grows on"
             warnings.warn(what, stacklevel=4)
@@ -163,16 +163,16 @@ class MapJournal:
 
 def _record(value: Any) -> bytes:
     data = packed(value)
-    return HEAD.pack(MAGIC, len(data), zlib.crc32(data)) + data
+    return RECORD_HEADER.pack(MAGIC, len(data), zlib.crc32(data)) + data
 
 
 def _next_record(file: io.BufferedReader) -> bytes | None:
-    """The bytes of the next whole record; None at the end, or where the rest is torn."""
-    head = file.read(HEAD.size)
-    if len(head) < HEAD.size:
+    """The bytes of the next whole record; None at the end, or if the rest is torn."""
+    head = file.read(RECORD_HEADER.size)
+    if len(head) < RECORD_HEADER.size:
         return None
-    magic, length, checksum = HEAD.unpack(head)
-    # A torn length may say anything: no room is made for more than the file holds.
+    magic, length, checksum = RECORD_HEADER.unpack(head)
+    # A torn length may be any number: no more is allocated than the file holds.
     if magic != MAGIC or length > os.fstat(file.fileno()).st_size:
         return None
     record = file.read(length)
@@ -180,11 +180,11 @@ def _next_record(file: io.BufferedReader) -> bytes | None:
 
 
 def packed(value: Any) -> bytes:
-    """A tree of plain values, lists, tuples, dictionaries, arrays and dataclasses of KINDS as bytes: parts, each behind
-    its length (8 bytes), the first the tree as JSON, the others its arrays.
+    """A tree of plain values, lists, tuples, dictionaries, arrays and dataclasses of RECORD_TYPES as bytes: parts, each
+    preceded by its length (8 bytes), first the tree as JSON, then its arrays.
 
-    In the JSON only lists and plain values stand for themselves. Everything else is an object with one entry, which
-    names the kind: {"array": its number}, {"tuple": [...]}, {"dict": [[key, value], ...]}, {"Camera": [its fields]}.
+    In the JSON, only lists and plain values represent themselves. Everything else is an object with one entry, which
+    names its type: {"array": its number}, {"tuple": [...]}, {"dict": [[key, value], ...]}, {"Camera": [its fields]}.
     """
     arrays: list[NDArray[Any]] = []
 
@@ -206,7 +206,7 @@ def packed(value: Any) -> bytes:
 
 
 def unpacked(data: bytes, source: str) -> Any:
-    """The value that was `packed`. OgPointcloudError, which names the source, for bytes that are anything else."""
+    """The value that was `packed`. OgPointcloudError, naming the source, for any other bytes."""
     parts, at = [], 0
 
     def value(tree: Any) -> Any:
@@ -218,7 +218,7 @@ def unpacked(data: bytes, source: str) -> Any:
         if kind == "array":
             return array_from_npy(parts[1 + of]).copy()  # writable: the map goes on growing
         entries = [value(entry) for entry in of]
-        return dict(entries) if kind == "dict" else tuple(entries) if kind == "tuple" else KINDS[kind](*entries)
+        return dict(entries) if kind == "dict" else tuple(entries) if kind == "tuple" else RECORD_TYPES[kind](*entries)
 
     try:
         while at < len(data):

@@ -1,8 +1,8 @@
-"""What a map knows of its instances beyond one visit: when each was last seen, and what became of it.
+"""What a map knows about its instances beyond one visit: when each was last seen, and what became of it.
 
-It is kept in the cloud's provenance under "map", as plain JSON. A file without it, as `fit` writes, is a map too: of
-one visit, in which all was present. Ids are rows of the instance table and are never given twice: an instance that left
-keeps its row, without points.
+It is kept in the cloud's provenance under "map", as plain JSON. A file without it, as written by `fit`, is also a map:
+of one visit in which everything was present. Ids are rows of the instance table and are never given twice: an instance
+that left keeps its row, without points.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ KEY = "map"
 
 @dataclass(frozen=True)
 class VisitEntry:
-    """A visit. name: of its capture. stamp: when, seconds or a count, whatever its frames have. views: how many."""
+    """A visit. name: of its capture. stamp: its time, in seconds or a count, like its frames'. views: their number."""
 
     name: str
     stamp: float
@@ -30,9 +30,9 @@ class VisitEntry:
 
 @dataclass
 class MapRecord:
-    """visits: in their order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by
-    id, where it was before it moved last. gone: by id, for instances that left and have not come back, how they looked;
-    their descriptors are not stored twice, as the table still has them."""
+    """visits: in order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by id,
+    its place before its last move. gone: by id, the look of instances that left and have not come back; their
+    descriptors are not stored twice, as the table still has them."""
 
     visits: list[VisitEntry] = field(default_factory=list)
     last_seen: dict[int, float] = field(default_factory=dict)
@@ -41,7 +41,7 @@ class MapRecord:
 
     @classmethod
     def of(cls, cloud: LabelledCloud) -> MapRecord:
-        """The record of a map; of a cloud as a fit makes it, one visit that saw every instance.
+        """The record of a map; for a cloud made by `fit`, one visit that saw every instance.
 
         OgPointcloudError where a file holds something else under that name.
         """
@@ -62,7 +62,7 @@ class MapRecord:
             ) from None
         if not record.visits:
             raise OgPointcloudError("the map's record has no visit; expected one or more: fit it again")
-        # Ids are rows of the table: one beyond it would be found only where somebody asks for it.
+        # Ids are rows of the table: one beyond it would be noticed only when it is used.
         ids = {*record.last_seen, *record.moved_from, *record.gone}
         if ids and not 0 <= min(ids) <= max(ids) < count:
             raise OgPointcloudError(f"the map's record names instance {max(ids)} of {count}: fit it again")
@@ -70,7 +70,7 @@ class MapRecord:
 
     def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:
         """The provenance with this record, JSON-able."""
-        # Of how a thing looked, all but its descriptors, which the table has.
+        # The look without its descriptors, which the table has.
         gone = {
             k: {"place": look.place.tolist(), "length": look.length,
                 "color": None if look.color is None else look.color.tolist()}

@@ -2,9 +2,9 @@
 
 A frame is checked, then compared with the map: which points it measures again, which it sees through, which it cannot
 see. Its depth adds points; its masks vote (`tracks`); what it shows is kept as rows of the mask table (`kept_views`),
-and the frame itself is let go. Points seen through from two places leave, and an object leaves with most of its visible
-points. All of this touches only what the frame sees. `snapshot` then labels every point by the batch rule from the rows
-kept.
+and the frame itself is dropped. Points seen through from two places are removed, and an object leaves with most of its
+visible points. All of this touches only what the frame sees. `snapshot` then labels every point by the batch rule from
+the kept rows.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
-from og_pointcloud.mapping.frame import COMPARED, CheckedFrame, Frame, checked, require_same_place
+from og_pointcloud.mapping.frame import COMPARED_POINTS, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points, measured_points, vote
 from og_pointcloud.mapping.labelling import labelled, matched_ids, with_ids
 from og_pointcloud.mapping.map_journal import MapJournal
-from og_pointcloud.mapping.map_objects import MapObject, leave, name, objects_of
+from og_pointcloud.mapping.map_objects import MapObject, assign_ids, objects_of, remove_points
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Visit
@@ -43,19 +43,18 @@ from og_pointcloud.settings import FitSettings, fit_settings
 
 PIXELS_PER_SPACING = 4.0
 """The spacing of a map that starts empty, in pixels of the first depth image at its median depth."""
-PRUNED_EVERY = 64
-"""Frames after which tracks that came to nothing are let go."""
-USUAL_SHARE = 0.3
-"""Share of an object's points that a frame usually shows: an earlier map does not say it."""
-KNOWN_VOTES = 8.0
-"""Votes that a point of an earlier map has for its instance; frames can outvote them."""
+PRUNE_EVERY_FRAMES = 64
+"""Tracks that never became objects are dropped after each this many frames."""
+TYPICAL_SHOWN_SHARE = 0.3
+"""Share of an object's points that a frame typically shows, assumed for an earlier map, which does not record it."""
+PRIOR_VOTES = 8.0
+"""Votes of a point of an earlier map for its instance; frames can outvote them."""
 
 
 @dataclass(frozen=True)
 class FrameChange:
-    """What a frame changed, by object ids. new: objects that enough frames have shown now; updated: objects seen again;
-    gone: objects of which most visible points were seen through; moved: where they were and are. seconds: time taken.
-    """
+    """Changes by a frame, as object ids. new: objects that enough frames have now shown. updated: objects seen again.
+    gone: objects whose visible points were mostly seen through. moved: where they were and are. seconds: time taken."""
 
     new: tuple[int, ...] = ()
     updated: tuple[int, ...] = ()
@@ -68,12 +67,12 @@ class Mapper:
     """A map that grows: `integrate` takes a frame, `objects` lists what is known, `snapshot` is a scene that can be
     asked, `save` writes it.
 
-    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: known geometry,
+    start: a map (.ogpc, scene or cloud) to continue; None: an empty one, which grows by depth. cloud: known geometry,
     so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes; rows with
     NaN or infinity are left out with a warning.
-    spacing: of a map that starts empty, world lengths; None: by the first depth image. feature_space: the name of the
-    masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); one that holds it already is
-    gone on with.
+    spacing: of a map that starts empty, in world units; None: from the first depth image. feature_space: name of the
+    masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); a map that it holds already is
+    continued.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
@@ -105,53 +104,53 @@ class Mapper:
         self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
         self._base = None if start is None else as_scene(start).cloud
         self._map: GrowingMap | None = None
-        self._around: Neighborhood | None = None  # of a known cloud
+        self._neighborhood: Neighborhood | None = None  # of a known cloud
         self._rows = np.zeros(0, np.int64)  # of its points, in their order
         self._labelled: tuple[int, LabelledScene] | None = None
         self._changes: Changes | None = None
         if self._base is not None:
-            self._go_on(self._base)
+            self._continue(self._base)
         elif cloud is not None:
             points = cloud if isinstance(cloud, Points) else Points.from_world(_placed(world_points(cloud)))
-            self._know(points, self._space, None, grows=False)
+            self._start_from(points, self._space, None, grows=False)
         self._journal = None if journal is None else self._resumed(MapJournal(journal, self._began_with))
 
-    def _know(self, points: Points, space: FeatureSpace, spacing: float | None, *, grows: bool) -> GrowingMap:
-        """Begin with points that are known. spacing None: their own."""
+    def _start_from(self, points: Points, space: FeatureSpace, spacing: float | None, *, grows: bool) -> GrowingMap:
+        """Start with known points. spacing None: their own."""
         if not len(points):
             raise SceneError("the map has 0 points; expected at least one: begin an empty one, without start and cloud")
         require_finite(points.xyz)
-        self._around = neighborhood(points.xyz, self.settings.geometry)
-        spacing = float(np.median(self._around.spacing)) if spacing is None else spacing
-        scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
+        self._neighborhood = neighborhood(points.xyz, self.settings.geometry)
+        spacing = float(np.median(self._neighborhood.spacing)) if spacing is None else spacing
+        scatter = DiscSurface(points.xyz, self._neighborhood).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
         self._rows = self._map.points.add_known(points.xyz, points.rgb)
-        self._map.spacing = self._around.spacing[np.argsort(self._rows)]
+        self._map.spacing = self._neighborhood.spacing[np.argsort(self._rows)]
         self._map.grow()
         return self._map
 
-    def _go_on(self, base: LabelledCloud) -> None:
-        """Take a map's points and instances as they are."""
-        known = self._know(Points(base.xyz, base.origin, base.rgb), base.space, base.spacing, grows=True)
+    def _continue(self, base: LabelledCloud) -> None:
+        """Adopt a map's points and instances as they are."""
+        map_ = self._start_from(Points(base.xyz, base.origin, base.rgb), base.space, base.spacing, grows=True)
         record, table = MapRecord.of(base), base.instances
-        known.stamp = record.visits[-1].stamp
+        map_.stamp = record.visits[-1].stamp
         for k in range(len(table)):
             rows = table.descriptors[table.descriptor_instance == k].astype(np.float64)
-            pixels = float(max(USUAL_SHARE * table.points[k] * table.masks[k], 1e-6))
+            pixels = float(max(TYPICAL_SHOWN_SHARE * table.points[k] * table.masks[k], 1e-6))
             # The sum of features that gives the track the descriptor's direction and the table's agreement.
             mean = rows.sum(axis=0)
             length = float(np.linalg.norm(mean))
             total = mean * (float(table.agreement[k]) * pixels / length) if length else None
             seen = record.last_seen.get(k, 0.0)
             counts = int(table.views[k]), int(table.masks[k])
-            known.tracks.add(Track(total, pixels, *counts, seen, id=k))
-        known.tracks.next_id = len(table)
+            map_.tracks.add(Track(total, pixels, *counts, seen, id=k))
+        map_.tracks.next_id = len(table)
         for k, entry in record.gone.items():
-            known.tracks.tracks[k].left = entry
+            map_.tracks.tracks[k].left = entry
         of = base.instance_ids >= 0
         rows, ids = self._rows[of], base.instance_ids[of]
-        known.votes.add(rows, ids, np.full(len(rows), KNOWN_VOTES, np.float32), np.zeros(len(table), np.bool_))
-        known.tracks.place(known.points.xyz, rows, ids)
+        map_.votes.add(rows, ids, np.full(len(rows), PRIOR_VOTES, np.float32), np.zeros(len(table), np.bool_))
+        map_.tracks.extend_boxes(map_.points.xyz, rows, ids)
 
     @property
     def _began_with(self) -> str:
@@ -161,7 +160,7 @@ class Mapper:
         return f"{len(xyz)} points (checksum {zlib.crc32(np.ascontiguousarray(xyz).tobytes())})"
 
     def _resumed(self, journal: MapJournal) -> MapJournal:
-        """Go on from what a journal holds."""
+        """Restore and continue what a journal holds."""
         self._map = journal.state() or self._map
         self._journal = None  # changes of the journal are not written to it again
         for number, change in journal.changes():
@@ -175,77 +174,76 @@ class Mapper:
                     self.correct(change) if isinstance(change, dict) else self.integrate(change)
             except OgPointcloudError:
                 raise
-            except Exception as error:  # it failed when it came first, too: a map in a queue went on then
+            except Exception as error:  # it failed the first time, too, and a map in a queue went on then
                 warnings.warn(f"change {number} of the journal fails ({type(error).__name__}: {error})", stacklevel=4)
         return journal
 
     def holds(self, stamp: float) -> bool:
-        """Whether a frame of this stamp is in the map; of one before the last few thousand frames it is believed."""
-        known = self._map
-        return known is not None and (stamp in known.recent or stamp < known.remembered_since)
+        """Whether a frame of this stamp is in the map; assumed for stamps before the last few thousand frames."""
+        map_ = self._map
+        return map_ is not None and (stamp in map_.recent or stamp < map_.remembered_since)
 
     @property
     def points(self) -> int:
-        """How many points the map has."""
+        """Number of points of the map."""
         return 0 if self._map is None else int(np.count_nonzero(self._map.points.alive))
 
     @property
     def nbytes(self) -> int:
-        """Bytes of what is kept of the frames; points and votes take about 150 bytes a point on top of that."""
+        """Bytes kept of the frames; points and votes take about 150 bytes per point on top of that."""
         return 0 if self._map is None else self._map.kept.nbytes
 
     def integrate(self, frame: Frame) -> FrameChange:
-        """Take a frame in. SceneError or FeatureSpaceError, with the cause and the cure, leave the map as it was.
+        """Integrate a frame. SceneError or FeatureSpaceError, with cause and remedy, leave the map unchanged.
 
-        Frames may come in any order; masks of a frame that has no depth, or comes late, are placed by the map's points.
+        Frames may come in any order; masks of a frame without depth, or a late one, are placed by the map's points.
         """
         start = time.perf_counter()
-        given, known = self._checked(frame)
-        if given.view is not None:
-            about = known.points.xyz[known.about(given.camera, most=COMPARED)]
-            require_same_place(given.stamp, given.view, about, known.presence.tolerance)
+        valid, map_ = self._checked(frame)
+        if valid.view is not None:
+            nearby = map_.points.xyz[map_.rows_in_view(valid.camera, most=COMPARED_POINTS)]
+            require_same_place(valid.stamp, valid.view, nearby, map_.presence.tolerance)
         if self._journal is not None:
-            self._journal.append(known.sequence, replace(frame, stamp=given.stamp))
-        # From here on the map changes, and nothing is refused any more.
-        self._map, known.stamp = known, max(known.stamp, given.stamp)
+            self._journal.append(map_.sequence, replace(frame, stamp=valid.stamp))
+        # From here on the map changes, and nothing is refused anymore.
+        self._map, map_.stamp = map_, max(map_.stamp, valid.stamp)
         rows, died, new, again = np.zeros(0, np.int32), np.zeros(0, np.int32), [], []
-        if given.view is not None:
-            measured, died = known.judge(given.view, given.stamp)
-            rows = np.concatenate([measured, known.add(given)])
-        if len(given.features):
-            drawn = None if given.view else drawn_points(given, known, self.settings.geometry)
-            new, again = vote(given, known, drawn or measured_points(given, known, rows))
-        gone = leave(known, died, given.stamp)
-        new_ids, moved = name(known, new, again, gone)
-        updated = tuple(sorted(known.tracks.tracks[k].id for k in again))
-        if known.sequence % PRUNED_EVERY == PRUNED_EVERY - 1:
-            known.tracks.prune(known.votes, given.stamp)
-        known.count(given.stamp)
+        if valid.view is not None:
+            measured, died = map_.judge(valid.view, valid.stamp)
+            rows = np.concatenate([measured, map_.add(valid)])
+        if len(valid.features):
+            drawn = None if valid.view else drawn_points(valid, map_, self.settings.geometry)
+            new, again = vote(valid, map_, drawn or measured_points(valid, map_, rows))
+        gone = remove_points(map_, died, valid.stamp)
+        new_ids, moved = assign_ids(map_, new, again, gone)
+        updated = tuple(sorted(map_.tracks.tracks[k].id for k in again))
+        if map_.sequence % PRUNE_EVERY_FRAMES == PRUNE_EVERY_FRAMES - 1:
+            map_.tracks.prune(map_.votes, valid.stamp)
+        map_.count(valid.stamp)
         if self._journal is not None:
-            self._journal.settle(known)
+            self._journal.compact(map_)
         return FrameChange(new_ids, updated, tuple(gone), moved, time.perf_counter() - start)
 
     def objects(self) -> list[MapObject]:
-        """What is known now, by id: objects that two frames or more have shown, and those that left."""
+        """All objects, by id: those that at least two frames have shown, and those that left."""
         return [] if self._map is None else objects_of(self._map)
 
     def snapshot(self) -> LabelledScene:
-        """The map as a scene like any other, by the batch rule over what was kept; made once while nothing changes.
+        """The map as a regular scene, labelled by the batch rule from the kept views; cached until the map changes.
 
-        If the mapper went on with a map, this is that map with the visit folded in, as by `og.update`. SceneError while
-        it has no mask.
+        If the mapper continues a map, this is that map with the visit merged in, as by `og.update`. SceneError while it
+        has no mask.
         """
-        known = self._map
-        if known is None or not known.kept.views:
+        map_ = self._map
+        if map_ is None or not map_.kept.views:
             raise SceneError("no frame with masks has shown any point of the map yet: integrate some first")
-        if self._labelled is None or self._labelled[0] != known.sequence:
-            self._labelled = known.sequence, LabelledScene.from_cloud(self._label(known))
+        if self._labelled is None or self._labelled[0] != map_.sequence:
+            self._labelled = map_.sequence, LabelledScene.from_cloud(self._label(map_))
         return self._labelled[1]
 
     @property
     def changes(self) -> Changes | None:
-        """What the latest snapshot found changed since the map that the mapper went on with; None where there is
-        none."""
+        """Changes that the latest snapshot found since the map that the mapper continues; None without one."""
         return self._changes
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -258,9 +256,9 @@ class Mapper:
         """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world
         coordinates.
 
-        Points move with the frame that brought them, kept views with theirs; the points of a known cloud stay.
-        SceneError for what is no pose, and where no stamp is that of a frame; then nothing moves. Where some are, a
-        warning names those that are not, as of frames that were refused.
+        Points move with the frame that added them, kept views with theirs; the points of a known cloud stay. SceneError
+        for an invalid pose, or if no stamp is a frame's; then nothing moves. If only some are, a warning names the
+        others, such as those of refused frames.
         """
         if not isinstance(poses, Mapping):
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
@@ -270,60 +268,61 @@ class Mapper:
         if self._journal is not None:
             self._journal.append(self._map.sequence, {stamp: of.world_to_camera for stamp, of in cameras.items()})
         self._map.correct(cameras)
-        self._around = None
+        self._neighborhood = None
         if self._journal is not None:
-            self._journal.settle(self._map)
+            self._journal.compact(self._map)
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
-        """The frame, and the map that it goes into: an empty one where there is none yet. Warns of a rounded pose."""
-        known = self._map
-        if known is not None:
-            given = checked(frame, known.origin, known.space, known.stamp + 1)
+        """The checked frame, and the map that it goes into: an empty one if there is none yet. Warns of a rounded
+        pose."""
+        map_ = self._map
+        if map_ is not None:
+            valid = checked(frame, map_.origin, map_.space, map_.stamp + 1)
         else:
             origin = np.zeros(3) if frame.camera is None else frame.camera.center
-            given = checked(frame, origin, self._space, 0.0)
-            if given.view is None:
+            valid = checked(frame, origin, self._space, 0.0)
+            if valid.view is None:
                 raise SceneError(
-                    f"frame {given.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
+                    f"frame {valid.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
                     "start with Mapper(cloud=points), or with a map, where frames have masks alone"
                 )
-            # By the image's own pixels: a sparse one is read with larger ones, but many frames fill the map in between.
-            pixel = given.view.pixel * given.view.camera.fx / given.camera.fx
-            spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, given.view.pixel)
-            known = GrowingMap.empty(origin, self._space, spacing)
-        if frame.camera is not None and (coarse := rounded_pose(frame.camera.world_to_camera, known.points.edge)):
+            # From the original pixels: a sparse image is read with larger ones, but many frames fill the gaps.
+            pixel = valid.view.pixel * valid.view.camera.fx / valid.camera.fx
+            spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, valid.view.pixel)
+            map_ = GrowingMap.empty(origin, self._space, spacing)
+        if frame.camera is not None and (coarse := rounded_pose(frame.camera.world_to_camera, map_.points.edge)):
             warnings.warn(f"frames may be placed wrongly; {coarse}", stacklevel=3)
-        return given, known
+        return valid, map_
 
-    def _label(self, known: GrowingMap) -> LabelledCloud:
-        """The points that are there, labelled by the batch rule, with the ids that objects have."""
-        chosen, around = known.points.alive, self._around
-        if self._base is not None:  # this visit is what its frames have looked at
-            chosen &= known.presence.seen_at[: known.points.n] > -np.inf
-        # Points that were given at the start in the order in which they were given, then those that frames brought.
-        rows = np.concatenate([self._rows, np.arange(len(self._rows), known.points.n)])
+    def _label(self, map_: GrowingMap) -> LabelledCloud:
+        """The points that are there, labelled by the batch rule, with the ids of the objects."""
+        chosen, around = map_.points.alive, self._neighborhood
+        if self._base is not None:  # this visit consists of what its frames have looked at
+            chosen &= map_.presence.seen_at[: map_.points.n] > -np.inf
+        # Points given at the start, in their given order, then those that frames added.
+        rows = np.concatenate([self._rows, np.arange(len(self._rows), map_.points.n)])
         rows = rows[chosen[rows]]
-        if around is None or not np.array_equal(rows, self._rows):  # as many may be others
-            around = neighborhood(known.points.xyz[rows], self.settings.geometry)
-        visit = labelled(known, rows, around, self.settings)
+        if around is None or not np.array_equal(rows, self._rows):  # the same number may be other points
+            around = neighborhood(map_.points.xyz[rows], self.settings.geometry)
+        visit = labelled(map_, rows, around, self.settings)
         if self._base is not None:
-            return self._folded(self._base, visit, known)
-        id_of_track = np.array([*(track.id for track in known.tracks.tracks), -1], np.int32)
+            return self._folded(self._base, visit, map_)
+        id_of_track = np.array([*(track.id for track in map_.tracks.tracks), -1], np.int32)
         wanted, count = matched_ids(
-            visit.instance_ids, len(visit.instances), id_of_track[known.owners()[rows]], known.tracks.next_id
+            visit.instance_ids, len(visit.instances), id_of_track[map_.owners()[rows]], map_.tracks.next_id
         )
-        if self._journal is not None and count > known.tracks.next_id:
-            self._journal.append(known.sequence, count)
-        known.tracks.next_id = count
+        if self._journal is not None and count > map_.tracks.next_id:
+            self._journal.append(map_.sequence, count)
+        map_.tracks.next_id = count
         return with_ids(visit, wanted, count)
 
-    def _folded(self, base: LabelledCloud, visit: LabelledCloud, known: GrowingMap) -> LabelledCloud:
-        """The map that the mapper went on with, and this visit."""
-        alive, presence = known.points.alive[self._rows], known.presence
+    def _folded(self, base: LabelledCloud, visit: LabelledCloud, map_: GrowingMap) -> LabelledCloud:
+        """The map that the mapper continues, with this visit merged in."""
+        alive, presence = map_.points.alive[self._rows], map_.presence
         again = alive & presence.present[self._rows], ~alive | presence.absent[self._rows]  # measured; seen through
         earlier, later = Visit(base), Visit(visit)
         found = compare_visits(earlier, later, again)
-        updated = merge(earlier, later, found, "frames", known.stamp)
+        updated = merge(earlier, later, found, "frames", map_.stamp)
         self._changes = updated.changes
         return updated.cloud
 

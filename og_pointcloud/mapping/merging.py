@@ -1,7 +1,7 @@
-"""A later visit folded into a map: what left is taken out, what came is added, what moved keeps its id.
+"""A later visit merged into a map: what left is removed, what came is added, what moved keeps its id.
 
 Points of the map that are seen through are removed, and so are all points of what left, except those that are still
-measured, as of the floor below it. Points of the visit are added where the map has none. What was not looked at stays
+measured, such as the floor below it. Points of the visit are added where the map has none. What was not looked at stays
 as it was.
 """
 
@@ -20,24 +20,24 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTa
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.colors import UNKNOWN_COLOR
-from og_pointcloud.mapping.changes import SAME_SURFACE, Changes, Comparison, compare_visits
+from og_pointcloud.mapping.changes import SAME_SURFACE_SPACINGS, Changes, Comparison, compare_visits
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
-from og_pointcloud.mapping.presence import FEWEST_POINTS, MOST, Visit
+from og_pointcloud.mapping.presence import MAJORITY, MIN_POINTS, Visit
 from og_pointcloud.mapping.sight import MeasuredView
 from og_pointcloud.rendering.geometry import nearest_in
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-SAME_PLACE = 1.0
-"""Spacings within which a point of the visit adds nothing to the map."""
-MOST_CAMERAS = 2000
-"""Cameras that a map remembers, the latest ones."""
+SAME_POINT_SPACINGS = 1.0
+"""A point of the visit within this many spacings of a map point adds nothing to the map."""
+MAX_CAMERAS = 2000
+"""Number of cameras that a map remembers, the latest ones."""
 
 
 @dataclass(frozen=True)
 class Updated:
     """cloud: the map after the visit. changes: gone and unseen by ids of the map before it, new and moved by ids of the
-    map after it; an id that both have means the same thing in both."""
+    map after it; an id that occurs in both maps means the same thing in both."""
 
     cloud: LabelledCloud
     changes: Changes
@@ -51,11 +51,11 @@ def update(
     settings: FitSettings | None = None,
     progress: bool = True,
 ) -> Updated:
-    """Fold a later capture of the same place, or of a part of it, into a map.
+    """Merge a later capture of the same place, or of a part of it, into a map.
 
     capture: in the map's world frame, with points of its own. depth: what its views measured, in the map's local frame
-    (`sight.view_of_depth`); None: what its points show. FeatureSpaceError for masks of another encoder, SceneError for
-    a capture that does not lie where the map does. The map that is given stays as it is: the new one is a copy.
+    (`sight.view_of_depth`); None: its points take the place of depth. FeatureSpaceError for masks of another encoder,
+    SceneError for a capture that does not lie where the map does. The given map is not changed: the new one is a copy.
 
     >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
@@ -76,16 +76,16 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     a, b = earlier.cloud, later.cloud
     stays, orphaned = _staying(earlier, found)
     ids_of_later = _ids_of_later(earlier, later, stays, found)
-    # Of the visit, only what lies where the map has nothing (left) is added: the map does not get denser by visits.
+    # Only those points of the visit are added that lie where the map has none (left): visits do not densify the map.
     adds: NDArray[np.bool_] = np.ones(len(b), bool)
     if stays.any():
-        adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_PLACE * a.spacing
+        adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_POINT_SPACINGS * a.spacing
     states = np.append(ids_of_later, [UNOBSERVED, BACKGROUND])  # -2 and -1 index the last two
     ids = np.concatenate([_relabelled(a, b, orphaned, states)[stays], states[b.instance_ids[adds]]]).astype(np.int32)
     changes = replace(found.changes, new=tuple(sorted({int(ids_of_later[k]) for k in found.changes.new})))
     record = MapRecord.of(a)
     stamp = record.visits[-1].stamp + 1 if stamp is None else stamp
-    _note(record, earlier, found, ids_of_later, VisitEntry(name, stamp, len(b.cameras)))
+    _record_visit(record, earlier, found, ids_of_later, VisitEntry(name, stamp, len(b.cameras)))
 
     def both(first: NDArray[Any] | None, second: NDArray[Any] | None) -> NDArray[Any] | None:
         return None if first is None or second is None else np.concatenate([first[stays], second[adds]])
@@ -99,38 +99,37 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
         rgb=None if a.rgb is None and b.rgb is None else both(*colors),
         certainty=both(a.certainty, b.certainty),
         provenance=record.added_to(a.provenance),
-        cameras=(*a.cameras, *b.cameras)[-MOST_CAMERAS:],
+        cameras=(*a.cameras, *b.cameras)[-MAX_CAMERAS:],
     )
     return Updated(merged, changes)
 
 
 def _staying(earlier: Visit, found: Comparison) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(n,) bool each of the map's points: those that stay; and those that stay though their instance left."""
+    """(n,) bool each over the map's points: those that stay; and those that stay although their instance left."""
     ids, still, through = earlier.cloud.instance_ids, found.evidence.still, found.evidence.through
     left, unseen = np.zeros((2, len(earlier.cloud.instances) + 2), bool)  # rows -2 and -1: unobserved and background
     left[[*found.changes.gone, *found.gone_pieces]] = True
     unseen[list(found.changes.unseen)] = True
-    # An instance of which it is not known whether it left keeps even the points that were seen through, unless these
-    # are a few strays.
-    unseen[:-2] &= earlier.count(through) >= FEWEST_POINTS
+    # If it is unknown whether an instance left, it keeps even the points that were seen through, unless these are a few
+    # strays.
+    unseen[:-2] &= earlier.count(through) >= MIN_POINTS
     return (~through | unseen[ids]) & (~left[ids] | still), left[ids] & still
 
 
 def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:
-    """(later instances,) their ids in the map: its old id for what moved or is back, a fresh one for what came, for
-    what was there already the id that most of its surface has, and a fresh one too for what the map did not know.
-    """
+    """(later instances,) their ids in the map: the old id for what moved or is back, a fresh one for what came, the id
+    of most of its surface for what was there already, and a fresh one too for what the map did not know."""
     count = fresh = len(earlier.cloud.instances)
     on_map = (found.nearest >= 0) & stays[found.nearest]
     owners = earlier.cloud.instance_ids[found.nearest]
-    on_none = np.where(owners == BACKGROUND, count, owners)  # a column of their own
-    shared = later.shared(np.where(on_map, on_none, UNOBSERVED), count + 1)
+    on_none = np.where(owners == BACKGROUND, count, owners)  # gets its own column
+    shared = later.overlap(np.where(on_map, on_none, UNOBSERVED), count + 1)
     best, most = (np.asarray(of).ravel() for of in (shared.argmax(axis=1), shared.max(axis=1).toarray()))
-    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))
+    was_there = (best < count) & (most >= MIN_POINTS) & (most > MAJORITY * shared.sum(axis=1))
     map_ids = np.where(was_there, best, -1)
     came = {moved.now: moved.id for moved in found.changes.moved} | found.back
     for k in range(len(map_ids)):
-        # All pieces of a thing that came get one id: the one that it had, if any, else the first piece's fresh one.
+        # All pieces of a thing that came share one id: the one it had, if any, else the first piece's fresh one.
         thing = found.pieces.get(k)
         if thing is not None:
             map_ids[k] = came.get(thing, -1)
@@ -144,22 +143,22 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
 def _relabelled(
     a: LabelledCloud, b: LabelledCloud, orphaned: NDArray[np.bool_], states: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """(n,) ids of the map's points. Points that lost their instance, or had never been seen, take the id of the visit's
+    """(n,) ids of the map's points. Points that lost their instance, or were never seen, take the id of the visit's
     nearest point on the same surface."""
     ids = np.where(orphaned, BACKGROUND, a.instance_ids).astype(np.int64)
-    asked = np.flatnonzero(orphaned | (ids == UNOBSERVED))
-    distance, nearest = nearest_in(cKDTree(b.xyz), a.xyz[asked])
-    near = distance <= SAME_SURFACE * a.spacing
-    ids[asked[near]] = states[b.instance_ids[nearest[near]]]
+    unowned = np.flatnonzero(orphaned | (ids == UNOBSERVED))
+    distance, nearest = nearest_in(cKDTree(b.xyz), a.xyz[unowned])
+    on_surface = distance <= SAME_SURFACE_SPACINGS * a.spacing
+    ids[unowned[on_surface]] = states[b.instance_ids[nearest[on_surface]]]
     return ids
 
 
 def joined(
     a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], ids: NDArray[np.integer]
 ) -> InstanceTable:
-    """One table of both: counts under one id add up, means are weighted by the number of masks.
+    """Both tables as one: counts under one id add up, means are weighted by the number of masks.
 
-    ids_of_b: (len(b),) the id that each instance of b gets; those of a keep theirs. ids: (n,) of all points.
+    ids_of_b: (len(b),) new id of each instance of b; those of a keep theirs. ids: (n,) of all points.
     """
     count = max(len(a), int(ids_of_b.max(initial=-1)) + 1)
     owner = np.concatenate([np.arange(len(a)), ids_of_b])
@@ -176,7 +175,7 @@ def joined(
     for k in np.flatnonzero(ids_of_b >= len(a)):  # those of a keep theirs
         new, above = ids_of_b[k], np.append(ids_of_b, -1)[b.part_of[k]]
         coarse[new] = -1 if b.coarse[k] < 0 else b.coarse[k] + a.coarse.max(initial=-1) + 1  # clusters of b alone
-        # Several instances of b may be one now, of which none is a part of itself.
+        # Several instances of b may be one now, which must not be a part of itself.
         lineage = [above]
         while lineage[-1] >= 0:
             lineage.append(part_of[lineage[-1]])
@@ -200,7 +199,7 @@ def _descriptors(
     a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Descriptors of each id, and the id of each. One descriptor in the map and one in the visit become their mean,
-    weighted by masks. Where either has several, which of them belong together is not known: the map's stay, or the
+    weighted by masks. If either has several, it is unknown which of them belong together: the map's stay, or the
     visit's where the map has none."""
     nothing = np.zeros((0, max(a.descriptors.shape[1], b.descriptors.shape[1])))
     of_id, weight = [nothing] * count, np.zeros(count)
@@ -217,12 +216,12 @@ def _descriptors(
     return np.concatenate([nothing, *(rows for rows in of_id if len(rows))]).astype(np.float32), owners
 
 
-def _note(
+def _record_visit(
     record: MapRecord, earlier: Visit, found: Comparison, ids_of_later: NDArray[np.int64], entry: VisitEntry
 ) -> None:
-    """Write into the record what the visit saw; an instance that it did not look at keeps the time it was last seen."""
+    """Record what the visit saw. An instance that it did not look at keeps the time when it was last seen."""
     record.visits.append(entry)
-    looked_at = earlier.count(found.evidence.still) >= FEWEST_POINTS
+    looked_at = earlier.count(found.evidence.still) >= MIN_POINTS
     looked_at[list(found.changes.unseen)] = False
     for k in {*np.flatnonzero(looked_at).tolist(), *ids_of_later.tolist()}:
         record.last_seen[k] = entry.stamp
@@ -230,6 +229,6 @@ def _note(
         record.moved_from[moved.id] = tuple(moved.before.tolist())
     for k in found.back.values():
         del record.gone[k]
-    # Smaller pieces of what moved are rows without points too: the thing goes on under the id of its largest piece.
+    # Smaller pieces of what moved become rows without points too: the thing keeps the id of its largest piece.
     for k in {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}:
         record.gone[k] = earlier.look(k, earlier.rows[k])

@@ -1,8 +1,8 @@
 """Points of a growing map: one for each voxel of the map's spacing, in arrays that only grow, found by a voxel hash.
 
-A place that is measured again moves its point towards the mean of all readings. A point keeps its row for good, as
-votes and evidence refer to it. Rows are also filed by place, in packets of neighbors, so that a frame goes only
-through the packets before its camera.
+Further readings in a voxel move its point towards their mean. A point never changes its row, as votes and evidence
+refer to it. Rows are also indexed by place, in packets of neighbors, so that a frame searches only the packets in front
+of its camera.
 """
 
 from __future__ import annotations
@@ -16,100 +16,100 @@ from numpy.typing import NDArray
 from og_pointcloud.kernels import njit
 from og_pointcloud.scene import Camera
 
-ACROSS = 1 << 20
-"""Voxels to either side of the origin: three indices of 21 bits fit one 64-bit key, which is never negative."""
-MOST_WEIGHT = 32.0
-"""Readings that a point's mean counts for at most, so that it follows what is measured now."""
-EMPTY = np.int64(-1)
+MAX_VOXEL_INDEX = 1 << 20
+"""Voxels to either side of the origin: three indices of 21 bits fit into one 64-bit key, which is never negative."""
+MAX_READINGS = 32.0
+"""Maximum number of readings that a point's mean counts for, so that it follows what is measured now."""
+EMPTY_KEY = np.int64(-1)
 """Key of a free slot of the hash."""
-BRICK = 16
-"""Voxels along each side of a brick, by which rows are put in order of place."""
-PACKET = 128
-"""Rows of a packet; the last packet of each batch of new points may have fewer."""
-REFILED = 1.25
-"""All points are filed anew once there are this many times as many as when that was done last."""
+BRICK_VOXELS = 16
+"""Voxels along each side of a brick, by which rows are sorted in space."""
+PACKET_ROWS = 128
+"""Rows per packet; the last packet of each batch of new points may have fewer."""
+REINDEX_GROWTH = 1.25
+"""All points are indexed again once their number has grown by this factor since the last time."""
 
 
 @dataclass
 class Columns:
-    """Arrays with one row a point that grow together, by half of their length at least. SPARE: by name, what new rows
-    hold, if not 0."""
+    """Arrays with one row per point that grow together, at least by half their length. FILL_VALUES: by name, of new
+    rows, if not 0."""
 
-    SPARE: ClassVar[dict[str, float]] = {}
+    FILL_VALUES: ClassVar[dict[str, float]] = {}
 
     def grow(self, n: int) -> None:
-        """Room for n points."""
+        """Allocate rows for n points."""
         for name, rows in list(vars(self).items()):
             if isinstance(rows, np.ndarray) and n > len(rows):
                 more = max(n - len(rows), len(rows) // 2)
-                spare = np.full((more, *rows.shape[1:]), self.SPARE.get(name, 0), rows.dtype)
+                spare = np.full((more, *rows.shape[1:]), self.FILL_VALUES.get(name, 0), rows.dtype)
                 setattr(self, name, np.concatenate([rows, spare]))
 
 
 @dataclass
 class VoxelHash:
-    """Voxel -> row of its point, by open addressing. keys: (slots,) int64 of voxels, EMPTY where there is none; rows:
-    (slots,) of their points. The number of slots is a power of two."""
+    """Voxel -> row of its point, by open addressing. keys: (slots,) int64 of voxels, EMPTY_KEY where there is none;
+    rows: (slots,) of their points. The number of slots is a power of two."""
 
-    keys: NDArray[np.int64] = field(default_factory=lambda: np.full(4096, EMPTY))
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.full(4096, EMPTY_KEY))
     rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros(4096, np.int32))
 
     def reserve(self, count: int) -> None:
-        """Stay at most half full with so many keys: linear probing slows down beyond."""
+        """Stay at most half full with this many keys: linear probing slows down beyond."""
         if 2 * count > len(self.keys):
             size, before = 1 << int(2 * count - 1).bit_length(), (self.keys, self.rows)
-            self.keys, self.rows = np.full(size, EMPTY), np.zeros(size, np.int32)
+            self.keys, self.rows = np.full(size, EMPTY_KEY), np.zeros(size, np.int32)
             _index(*before, self.keys, self.rows)
 
 
 @dataclass
 class Packets:
-    """Rows of points by place. side: edge of a brick. order: (n,) int32, rows packet by packet; starts: (packets + 1,)
-    int32, where each packet begins in it. low, high: (packets, 3) float32, the box of its points when they were filed.
-    settled: how many points there were when all were filed last."""
+    """Spatial index of rows. side: edge of a brick. order: (n,) int32, rows packet by packet; starts: (packets + 1,)
+    int32, where each packet begins in it. low, high: (packets, 3) float32, box of its points when they were indexed.
+    indexed: number of points when all were last indexed together."""
 
     side: float
-    settled: int = 0
+    indexed: int = 0
     order: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     starts: NDArray[np.int32] = field(default_factory=lambda: np.zeros(1, np.int32))
     low: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     high: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
-    def file(self, xyz: NDArray[np.float32]) -> None:
-        """File those of the points (n, 3) that are not filed yet."""
+    def add(self, xyz: NDArray[np.float32]) -> None:
+        """Index those of the points (n, 3) that are not indexed yet."""
         first, n = len(self.order), len(xyz)
         if n == first:
             return
         # Packets of new points lie between older ones in space, and their boxes overlap: from time to time, as the map
-        # grows, all are filed from the start. Growth by a constant factor keeps the cost a point constant.
-        if n > REFILED * self.settled:
-            first, self.settled, self.starts, self.low, self.high = 0, n, self.starts[:1], self.low[:0], self.high[:0]
+        # grows, all are indexed again. Growth by a constant factor keeps the cost per point constant.
+        if n > REINDEX_GROWTH * self.indexed:
+            first, self.indexed, self.starts, self.low, self.high = 0, n, self.starts[:1], self.low[:0], self.high[:0]
         order = first + np.argsort(_keys(xyz[first:], self.side), kind="stable").astype(np.int32)
-        begins = np.arange(0, n - first, PACKET)
+        begins = np.arange(0, n - first, PACKET_ROWS)
         self.order = np.concatenate([self.order[:first], order])
         self.starts = np.concatenate([self.starts[:-1], first + begins, [n]]).astype(np.int32)
         self.low = np.concatenate([self.low, np.minimum.reduceat(xyz[order], begins)])
         self.high = np.concatenate([self.high, np.maximum.reduceat(xyz[order], begins)])
 
-    def before(self, camera: Camera, edge: float, margin: float = 0.0) -> NDArray[np.int32]:
+    def in_view(self, camera: Camera, edge: float, margin: float = 0.0) -> NDArray[np.int32]:
         """Rows of packets that may have points in an image, or within a share ``margin`` beyond its border: the sphere
-        around the packet's box meets the frustum. edge: of a voxel; no point has moved by two since it was filed, as it
-        stays in its voxel."""
+        around the packet's box meets the frustum. edge: of a voxel; no point has moved by two of them since it was
+        indexed, as it stays in its voxel."""
         fx, fy, cx, cy = camera.intrinsics
         across, down = margin * camera.width, margin * camera.height
-        # The frustum is where all five products are positive: u > 0, for one, is fx x + cx z > 0. Its planes go through
-        # the camera, so that each is a normal alone, in the camera's frame, pointing inwards; the first is z = 0.
+        # The frustum is where all five dot products are positive: u > 0, for example, is fx x + cx z > 0. Its planes
+        # pass through the camera, so each is just an inward normal in the camera's frame; the first is z = 0.
         left, right = (fx, 0, cx + across), (-fx, 0, camera.width + across - cx)
         sides = np.array([(0, 0, 1), left, right, (0, fy, cy + down), (0, -fy, camera.height + down - cy)])
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        # In float64: in float32 the square of an outlier at 1e20 is no number.
+        # In float64: in float32 the square of an outlier at 1e20 overflows.
         pose, low, high = camera.world_to_camera, self.low.astype(np.float64), self.high.astype(np.float64)
         reach = 2 * edge + np.linalg.norm(high - low, axis=1) / 2
-        # (packets, 5) how far inside of each plane the middle of the box lies, by the normals turned into the map.
+        # (packets, 5) signed distance of the box center inside each plane, with the normals rotated into the map.
         inside = (low + high) / 2 @ (sides @ pose[:3, :3]).T + sides @ pose[:3, 3]
         return self._rows((inside > -reach[:, None]).all(axis=1))
 
-    def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
+    def in_box(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
         return self._rows(np.asarray(((self.low <= high) & (self.high >= low)).all(axis=1)))
 
@@ -120,7 +120,8 @@ class Packets:
 @dataclass
 class VoxelPoints(Columns):
     """n points; the arrays are longer, for those to come. edge: of a voxel. grows: whether measured points are added.
-    weight: float32 readings in the mean of each, 0 for a point that left: it keeps its row, for what may come there."""
+    weight: float32, number of readings in the mean of each, 0 for a point that left, which keeps its row for what may
+    come there."""
 
     edge: float
     grows: bool
@@ -133,7 +134,7 @@ class VoxelPoints(Columns):
     _anchor: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
-        self.packets.side = self.packets.side or BRICK * self.edge
+        self.packets.side = self.packets.side or BRICK_VOXELS * self.edge
 
     @property
     def xyz(self) -> NDArray[np.float32]:
@@ -152,46 +153,46 @@ class VoxelPoints(Columns):
 
     @property
     def anchor(self) -> NDArray[np.int32]:
-        """(n,) int32, the frame that a point was first seen by, -1 for points that no frame brought."""
+        """(n,) int32, the frame that first saw a point, -1 for points that no frame added."""
         return self._anchor[: self.n]
 
     def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> NDArray[np.int64]:
-        """Add points that are kept as they are, several in a voxel if they are so dense. Returns (n,) their rows."""
-        # By bricks, so that neighbors have rows close to each other.
+        """Add points that stay as they are, several per voxel if they are that dense. Returns (n,) their rows."""
+        # Sorted by brick, so that neighbors have rows close to each other.
         order = np.argsort(_keys(xyz, self.packets.side), kind="stable")
         self._reserve(len(xyz))
         rows = slice(self.n, self.n + len(xyz))
-        self._xyz[rows], self.weight[rows], self._anchor[rows] = xyz[order], MOST_WEIGHT, -1
+        self._xyz[rows], self.weight[rows], self._anchor[rows] = xyz[order], MAX_READINGS, -1
         self._rgb[rows] = 128 if rgb is None else rgb[order]
         self.n += len(xyz)
-        self.refile()
+        self.reindex()
         return np.argsort(order) + rows.start
 
     def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> bool:
-        """Take in measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new ones.
-        Returns whether it brought any: new ones, or what stands now where others had left."""
+        """Add measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new ones.
+        Returns whether any point is now of this frame: a new one, or one where others had left."""
         self._reserve(len(xyz))
         voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
         self.n, brought = _insert(xyz, rgb, anchor, self.edge, voxels, points, self.n)
-        self.packets.file(self.xyz)
+        self.packets.add(self.xyz)
         return brought
 
-    def refile(self) -> None:
-        """Find all points by their places again, after they were moved."""
-        self.hash.keys[:] = EMPTY
+    def reindex(self) -> None:
+        """Rebuild the hash and the spatial index after points were moved."""
+        self.hash.keys[:] = EMPTY_KEY
         _index(_keys(self.xyz, self.edge), np.arange(self.n), self.hash.keys, self.hash.rows)
         self.packets = Packets(self.packets.side)
-        self.packets.file(self.xyz)
+        self.packets.add(self.xyz)
 
     def _reserve(self, more: int) -> None:
-        """Room for so many more points."""
+        """Allocate room for this many more points."""
         self.grow(self.n + more)
         self.hash.reserve(self.n + more)
 
 
 @njit(cache=True, nogil=True)
 def turned(pose, p):  # noqa: ANN001, ANN201
-    """A direction in the camera's frame."""
+    """A direction rotated into the camera's frame."""
     return (
         pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2],
         pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2],
@@ -208,11 +209,11 @@ def in_camera(pose, p):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _key(x, y, z, edge):  # noqa: ANN001, ANN202
-    """The voxel as one number, 21 bits an axis; all beyond ACROSS voxels are clamped to the one at the border."""
+    """The voxel as one number, 21 bits per axis; all beyond MAX_VOXEL_INDEX are clamped to the outermost one."""
     key = np.int64(0)
     for value in (x, y, z):
-        index = min(max(np.floor(value / edge), -ACROSS), ACROSS - 1)
-        key = key * (2 * ACROSS) + np.int64(index) + ACROSS
+        index = min(max(np.floor(value / edge), -MAX_VOXEL_INDEX), MAX_VOXEL_INDEX - 1)
+        key = key * (2 * MAX_VOXEL_INDEX) + np.int64(index) + MAX_VOXEL_INDEX
     return key
 
 
@@ -226,44 +227,44 @@ def _keys(xyz, edge):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _slot(key, keys):  # noqa: ANN001, ANN202
-    """Where a key is, or would be put: linear probing from its hash."""
+    """The slot of a key, or where it would be put: linear probing from its hash."""
     # Times 2^64 over the golden ratio (Knuth, The Art of Computer Programming, 6.4), so that neighboring voxels differ
     # in the upper bits; the shift brings these down to the lower ones, which the mask keeps.
     mask = np.uint64(len(keys) - 1)
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     slot = (mixed ^ (mixed >> np.uint64(32))) & mask
-    while keys[slot] != key and keys[slot] != EMPTY:
+    while keys[slot] != key and keys[slot] != EMPTY_KEY:
         slot = (slot + np.uint64(1)) & mask
     return slot
 
 
 @njit(cache=True, nogil=True)
 def _index(new_keys, new_rows, keys, rows):  # noqa: ANN001, ANN202
-    """Put in what is not there yet; EMPTY keys are passed over."""
+    """Insert the keys that are not there yet; skips EMPTY_KEY."""
     for k in range(len(new_keys)):
         slot = _slot(new_keys[k], keys)
-        if new_keys[k] != EMPTY and keys[slot] == EMPTY:
+        if new_keys[k] != EMPTY_KEY and keys[slot] == EMPTY_KEY:
             keys[slot], rows[slot] = new_keys[k], new_rows[k]
 
 
 @njit(cache=True, nogil=True)
 def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
-    """The number of points after the new ones are in, and whether any is of this frame. All readings of a point lie in
-    its voxel, and so does their mean: its key stays what it is."""
+    """Number of points after the insertion, and whether any is of this frame. All readings of a point lie in its voxel,
+    and so does their mean: its key does not change."""
     (keys, rows), (xyz, rgb, weight, anchor) = voxels, points
     brought = False
     for i in range(len(new)):
         key = _key(new[i, 0], new[i, 1], new[i, 2], edge)
         slot = _slot(key, keys)
-        if keys[slot] == EMPTY:
+        if keys[slot] == EMPTY_KEY:
             keys[slot], rows[slot] = key, n
             xyz[n], rgb[n], weight[n], anchor[n] = new[i], color[i], 1, frame
             n, brought = n + 1, True
             continue
-        # A running mean; with the weight bounded it becomes a moving one. Weight 1 is a point that had left (0 before):
-        # it begins anew at the reading.
+        # A running mean; with bounded weight it becomes an exponential moving one. Weight 1 is a point that had left (0
+        # before): it starts again at the reading.
         row = rows[slot]
-        weight[row] = min(weight[row] + 1, MOST_WEIGHT)
+        weight[row] = min(weight[row] + 1, MAX_READINGS)
         if weight[row] == 1:
             anchor[row], brought = frame, True
         for a in range(3):

@@ -18,7 +18,7 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneErro
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.text.words import Labels
 
-OLDEST = (0, 19)
+MIN_VERSION = (0, 19)
 DEBIAN_LIBRARIES = "libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
 
 
@@ -125,8 +125,8 @@ def open3d() -> Any:
             f"Open3D is installed but does not load ({first_line(error)}): install the system libraries it "
             f"needs, on Debian and Ubuntu: apt-get install {DEBIAN_LIBRARIES}"
         ) from None
-    if tuple(map(int, re.findall(r"\d+", module.__version__)[:2])) < OLDEST:
-        oldest = "{}.{}".format(*OLDEST)
+    if tuple(map(int, re.findall(r"\d+", module.__version__)[:2])) < MIN_VERSION:
+        oldest = "{}.{}".format(*MIN_VERSION)
         raise OgPointcloudError(
             f"Open3D is {module.__version__}; this plugin needs {oldest} or later: pip install 'open3d>={oldest}'"
         )

@@ -26,11 +26,11 @@ from og_pointcloud_pyvista.files import RGB
 
 UNKNOWN_COLOR = (205, 205, 205)
 """Lighter than in the data: most of a scene may be unknown, and what is known should stand out."""
-LEGEND_ENTRIES = 20
+MAX_LEGEND_ENTRIES = 20
 """At most so many names in a legend, the most frequent ones; one more entry counts the points of the others."""
 LEGEND_MARGIN = 0.015
 HIGHLIGHT = "magenta"
-SHADE = 0.5
+MAX_DARKENING = 0.5
 """Share by which a label's color is darkened where the dataset's own color is black: shapes and shadows stay
 visible."""
 PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
@@ -198,10 +198,10 @@ class OgPlotter:
         counts = np.bincount(labels + 1, minlength=len(words) + 1)  # first: unknown, -1
         order = [int(label) for label in np.argsort(-counts[1:], kind="stable") if counts[1 + label]]
         entries = [(f"{words[label]}  {counts[1 + label]:,}", _colors(np.array([label]))[0]) for label in order]
-        if len(entries) > LEGEND_ENTRIES:
-            others = sum(counts[1 + label] for label in order[LEGEND_ENTRIES:])
-            entries = entries[:LEGEND_ENTRIES]
-            entries.append((f"{len(order) - LEGEND_ENTRIES} more  {others:,}", np.array((255, 255, 255))))
+        if len(entries) > MAX_LEGEND_ENTRIES:
+            others = sum(counts[1 + label] for label in order[MAX_LEGEND_ENTRIES:])
+            entries = entries[:MAX_LEGEND_ENTRIES]
+            entries.append((f"{len(order) - MAX_LEGEND_ENTRIES} more  {others:,}", np.array((255, 255, 255))))
         if counts[0]:
             entries.append((f"unknown  {counts[0]:,}", np.array(UNKNOWN_COLOR)))
         text = self._plotter.theme.font.color
@@ -250,7 +250,7 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
         return colors
     luminance = np.asarray(rgb)[:, :3] @ LUMINANCE
     bright = max(float(np.percentile(luminance, 95)), 1.0)
-    light = 1 - SHADE + SHADE * np.clip(luminance / bright, 0, 1)
+    light = 1 - MAX_DARKENING + MAX_DARKENING * np.clip(luminance / bright, 0, 1)
     return (colors * light[:, None]).astype(np.uint8)
 
 

@@ -39,13 +39,13 @@ OUTPUTS = {LABELLED: CLOUD, "/detections": DETECTION_ARRAY}
 LABEL_INFO = "/og_pointcloud/label_info"
 BAG_VERSION = 8
 """Version of rosbag2's metadata, which Humble and all later releases read."""
-NO_TIME = QosTime(2147483647, 4294967295)
+INFINITE_DURATION = QosTime(2147483647, 4294967295)
 """ROS 2's infinite duration: no deadline, no lifespan."""
-LATCHED = Qos(
-    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, NO_TIME, NO_TIME,
-    QosLiveliness.AUTOMATIC, NO_TIME, False,
+LATCHED_QOS = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, INFINITE_DURATION,
+    INFINITE_DURATION, QosLiveliness.AUTOMATIC, INFINITE_DURATION, False,
 )  # fmt: skip
-NO_HASH = "RIHS01_" + "0" * 64
+UNKNOWN_TYPE_HASH = "RIHS01_" + "0" * 64
 """Hash of a type that neither the bag defines nor rosbags knows: bags of Humble and older only name types."""
 
 VISION_MSGS: Mapping[str, str] = {
@@ -125,7 +125,7 @@ def label_bag(
             # Publishers of one topic and type that differ in QoS are several connections; in the new bag they are one.
             by_key = {(old.topic, old.msgtype): old for old in reader.connections}
             copies = {key: _copied(bag, old, store) for key, old in by_key.items()}
-            info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
+            info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED_QOS])
             names = to_label_info(segmenter.names, stamp=reader.start_time, messages=messages)
             bag.write(info, reader.start_time, store.serialize_cdr(names, INFO))
             ours = {
@@ -194,7 +194,7 @@ def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
     """The new bag's connection for a topic of the old one, with its type definition and QoS."""
     ext: Any = old.ext
     # As the old bag defines it; a type that it only names is defined by rosbags, if that knows it.
-    definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
+    definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or UNKNOWN_TYPE_HASH}
     if not (old.msgdef.data and old.digest) and old.msgtype in store.types:
         definition = {"typestore": store}
     return bag.add_connection(

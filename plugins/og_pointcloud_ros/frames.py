@@ -23,7 +23,7 @@ from og_pointcloud.scene import Camera
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 from og_pointcloud_ros.pointcloud2 import read_fields
 
-WHOLE = ("depth", "masks", "features")
+REQUIRED_ROLES = ("depth", "masks", "features")
 """Roles of messages that a frame waits for."""
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8": "u1", "bgr8": "u1", "mono8": "u1"}
 
@@ -62,8 +62,8 @@ class FrameAssembler:
     image_proc makes them: the camera_info beside them still tells the lens of the raw ones. waiting: by stamp, in
     nanoseconds, in the order in which they came."""
 
-    def __init__(self, whole: Iterable[str] = WHOLE, *, rectified: bool = False) -> None:
-        self.whole, self.rectified, self.waiting = tuple(whole), rectified, dict[int, _Parts]()
+    def __init__(self, required: Iterable[str] = REQUIRED_ROLES, *, rectified: bool = False) -> None:
+        self.required, self.rectified, self.waiting = tuple(required), rectified, dict[int, _Parts]()
         self._info: Any = None
         self._warned = False  # of colors that are left out
 
@@ -90,10 +90,10 @@ class FrameAssembler:
                 pixels = np.repeat(pixels[..., None], 3, axis=2)
             setattr(parts, role, pixels)
 
-    def is_whole(self, stamp: int) -> bool:
+    def is_complete(self, stamp: int) -> bool:
         """Whether all that a frame waits for has come, the camera among it."""
         parts = self.waiting[stamp]
-        return self._info is not None and all(getattr(parts, role) is not None for role in self.whole)
+        return self._info is not None and all(getattr(parts, role) is not None for role in self.required)
 
     def frame(self, stamp: int, pose: Callable[[str, int], NDArray[np.float64]]) -> Frame | None:
         """The frame of a stamp, from what has come of it; None where that is neither depth nor masks with features.

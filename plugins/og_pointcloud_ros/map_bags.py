@@ -14,11 +14,11 @@ from functools import partial
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.frame import Frame
 from og_pointcloud_ros.bags import decoded, messages_of, open_bag, ros2_types, transforms_of
-from og_pointcloud_ros.frames import WHOLE, FrameAssembler
+from og_pointcloud_ros.frames import REQUIRED_ROLES, FrameAssembler
 from og_pointcloud_ros.transforms import TransformTree
 
 IMAGE, INFO, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
-PENDING = 100
+MAX_PENDING_STAMPS = 100
 """Stamps that wait for their other messages; masks come seconds after their image."""
 
 
@@ -35,9 +35,9 @@ class BagFrames:
             self._roles = _roles([(c.topic, c.msgtype) for c in reader.connections], str(source))
 
     def __iter__(self) -> Iterator[Frame]:
-        whole = [role for role in WHOLE if role in self._roles.values()]
+        required = [role for role in REQUIRED_ROLES if role in self._roles.values()]
         rectified = any("rect" in topic.lower() for topic, role in self._roles.items() if role in ("depth", "masks"))
-        store, assembler = ros2_types(), FrameAssembler(whole, rectified=rectified)
+        store, assembler = ros2_types(), FrameAssembler(required, rectified=rectified)
         with open_bag(self.source) as reader:
             tree = transforms_of(reader, store)
             for connection, _, data in messages_of(reader, [c for c in reader.connections if c.topic in self._roles]):
@@ -47,8 +47,8 @@ class BagFrames:
                 except (OgPointcloudError, ValueError) as error:
                     self._drop(f"{role}: {error}")
                 # Frames that are whole; else the oldest of too many that wait, with what has come of them.
-                ready = [*filter(assembler.is_whole, assembler.waiting)]
-                for stamp in ready or sorted(assembler.waiting)[:-PENDING]:
+                ready = [*filter(assembler.is_complete, assembler.waiting)]
+                for stamp in ready or sorted(assembler.waiting)[:-MAX_PENDING_STAMPS]:
                     yield from self._made(stamp, assembler, tree)
             for stamp in sorted(assembler.waiting):
                 yield from self._made(stamp, assembler, tree)

@@ -36,7 +36,7 @@ from og_pointcloud_ros.node import PlacedNode, error_text, latest_only, run
 PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "rectified": False, "max_age": 2.0}
 """With their defaults; config/map.yaml explains them."""
 INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
-QUEUED = 10
+QUEUE_DEPTH = 10
 """Messages of a topic that may wait while a service answers."""
 
 
@@ -51,7 +51,7 @@ class MapNode(PlacedNode):
         self._queue = FrameQueue(self._empty(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
         for role, kind in INPUTS.items():
             take = partial(self._on_message, role)
-            self.create_subscription(kind, f"~/input/{role}", take, latest_only(best_effort, depth=QUEUED))
+            self.create_subscription(kind, f"~/input/{role}", take, latest_only(best_effort, depth=QUEUE_DEPTH))
         for name, serve in {"save": self._save, "load": self._load, "reset": self._reset}.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
 
@@ -71,7 +71,7 @@ class MapNode(PlacedNode):
         self._arrived = {stamp: self._arrived.get(stamp, now) for stamp in self._assembler.waiting}
         for stamp, arrived in self._arrived.items():
             is_old = now - arrived > self._max_age
-            if not is_old and not self._assembler.is_whole(stamp):
+            if not is_old and not self._assembler.is_complete(stamp):
                 continue
             try:
                 if (frame := self._assembler.frame(stamp, self._pose)) is not None:

@@ -45,7 +45,7 @@ PARAMETERS = {
 """With their defaults; config/parameters.yaml explains them. An empty list has no type in ROS, hence [""]."""
 RETRY_S = 0.02
 """Seconds between two tries to find a waiting cloud's transform: tf is often a little later than the cloud."""
-QUIET_S = 5.0
+WARNING_INTERVAL_S = 5.0
 """Seconds between two warnings at least."""
 
 
@@ -78,7 +78,7 @@ class PlacedNode(Node):
         return pose_of((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
     def _warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+        self.get_logger().warning(text, throttle_duration_sec=WARNING_INTERVAL_S)
 
 
 class SegmentNode(PlacedNode):

@@ -18,7 +18,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
-EXACT_WITHIN = 2.0**14
+MAX_FLOAT32_M = 2.0**14
 """Meters from 0, 16 km, within which float32 counts millimeters."""
 UNLABELLED = 65535
 """Label of a point without one: what vision_msgs/LabelInfo keeps for that among 16-bit ids."""
@@ -106,7 +106,7 @@ def to_pointcloud2(
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
     if double is None and xyz.dtype != np.float32:
         finite = np.abs(xyz[np.logical_and.reduce(np.isfinite(xyz), axis=1)])
-        double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > EXACT_WITHIN
+        double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > MAX_FLOAT32_M
     # One sub-array for x, y, z is filled at once; a view of the same bytes names the three.
     place = "<f8" if double else "<f4"
     colors = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]

@@ -17,11 +17,11 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
-LEAST_LENGTH = 1e-6
+MIN_QUATERNION_LENGTH = 1e-6
 """Length below which a quaternion says nothing of a rotation."""
-MOST_FRAMES = 1000
+MAX_CHAIN_FRAMES = 1000
 """Length of a chain of frames, each in the next; robots have tens."""
-NEARLY_EQUAL = 1 - 1e-8
+NEARLY_EQUAL_COSINE = 1 - 1e-8
 """Cosine of half the angle between two rotations above which the arc is straight, but for rounding."""
 
 
@@ -60,7 +60,7 @@ class TransformTree:
         """
         place, turn = np.asarray(translation, np.float64), np.asarray(rotation_xyzw, np.float64)
         length = float(np.linalg.norm(turn))
-        if not (np.isfinite(place).all() and np.isfinite(length) and length > LEAST_LENGTH):
+        if not (np.isfinite(place).all() and np.isfinite(length) and length > MIN_QUATERNION_LENGTH):
             raise TransformError(
                 f"the transform from '{child}' to '{parent}' is {place.tolist()}, {turn.tolist()}; expected finite "
                 "numbers and a rotation of length 1"
@@ -107,8 +107,8 @@ class TransformTree:
         path = [frame]
         while path[-1] in self._edges:
             parent = self._edges[path[-1]].parent
-            if len(path) == MOST_FRAMES:
-                raise TransformError(f"'{frame}' hangs on more than {MOST_FRAMES} frames; expected a robot's tree")
+            if len(path) == MAX_CHAIN_FRAMES:
+                raise TransformError(f"'{frame}' hangs on more than {MAX_CHAIN_FRAMES} frames; expected a robot's tree")
             if parent in path:
                 raise TransformError(f"frames hang on each other: {' in '.join([*path, parent])}; expected a tree")
             path.append(parent)
@@ -145,7 +145,7 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
     cosine = float(first @ second)
     if cosine < 0:  # q and -q are one rotation
         second, cosine = -second, -cosine
-    if cosine > NEARLY_EQUAL:  # the sines below would be 0 / 0
+    if cosine > NEARLY_EQUAL_COSINE:  # the sines below would be 0 / 0
         mixed = first + share * (second - first)
         return mixed / np.linalg.norm(mixed)
     angle = np.arccos(cosine)
