@@ -721,4 +721,4 @@ def test_points_are_judged_as_if_all_were_asked(spacing):
         view = view_of_depth(depth + np.random.default_rng(0).normal(0, 0.003, depth.shape) * (depth > 0), camera)
         states = np.where(points.alive, states_of_points(points.xyz, 0.01, view), NOTHING)
         told = np.flatnonzero((states == AGREES) | (states == THROUGH))
-        assert np.isin(told, packets.before(camera, points.edge)).all()
+        assert np.isin(told, packets.in_view(camera, points.edge)).all()

@@ -1,4 +1,4 @@
-"""A collection of scenes asked at once: words in, instances of all scenes out, best first."""
+"""A collection of scenes queried at once: words in, instances of all scenes out, best first."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.words import TextFeatures, resolve_labels, words_of
 
 DEFAULT_TOP = 20
-"""Findings that are answered unless told otherwise."""
+"""Default number of findings."""
 SAME_WORD_COSINE = 0.95
-"""Cosine from which two names are one word, which does not compete with itself: "mug" and "a mug"."""
+"""From this cosine on two names are one word, which does not compete with itself: "mug" and "a mug"."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An instance of some scene beside a word. center, size: of the axis-aligned box of its main part, (x, y, z) in its
-    scene's world frame and unit.
+    """An instance of some scene, found for a word. center, size: of the axis-aligned box of its main part, (x, y, z) in
+    its scene's world frame and unit.
 
-    score: where calibrated, the probability that it is what the word says; else LERF's relevancy, between 0 and 1: how
+    score: if calibrated, the probability that it is what the word says; else LERF's relevancy, between 0 and 1: how
     much better the word fits than the other words of the scene's encoder that are known here, or than a cosine of 0
-    where there are none; 0.5 is as well. fits: whether the score is above one half.
+    without any; 0.5 means equally well. fits: whether the score is above one half.
 
     >>> chair = og.Finding("office", 3, "chair", 0.9, (1.0, 2.0, 0.5), (0.5, 0.5, 1.0), 800, True, True)
     >>> list(chair.to_dict())
@@ -63,7 +63,7 @@ class Finding:
 
 
 class Findings(tuple[Finding, ...]):
-    """What was found, best first. not_asked: sentences on scenes that could not be asked for some word, and why.
+    """Findings, best first. not_asked: sentences about scenes that could not be asked for some word, and why.
 
     >>> og.Findings().to_json()
     '[]'
@@ -83,8 +83,8 @@ class Findings(tuple[Finding, ...]):
 
 
 class Collection:
-    """The scenes of an atlas (`Collection.index` makes one). Descriptors are read when they are first asked, and kept;
-    where only some scenes or a box are asked, only those are read.
+    """The scenes of an atlas (`Collection.index` makes one). Descriptors are read on first use, and kept; a query of
+    some scenes or a box reads only those.
 
     >>> import pathlib, tempfile
     >>> folder = pathlib.Path(tempfile.mkdtemp())
@@ -97,8 +97,8 @@ class Collection:
     """
 
     def __init__(self, path: StrPath, *, lance: str | None = None) -> None:
-        """path: of an atlas; OgPointcloudError for any other or damaged file. lance: folder or URI of what
-        `lance.write_lance` made of it, which is then searched in place of memory (extra 'lance')."""
+        """path: of an atlas; OgPointcloudError for any other or damaged file. lance: folder or URI of the database that
+        `lance.write_lance` made of it, which is then searched instead of memory (extra 'lance')."""
         self.path = Path(path)
         self._lance = None if lance is None else LanceTables(lance)
         self.changes: Changes | None = None
@@ -106,7 +106,7 @@ class Collection:
         self._open()
 
     def _open(self) -> None:
-        """Read what scenes there are, if the atlas is another one than when that was read."""
+        """Read the list of scenes, if the atlas has changed since it was last read."""
         state = self.path.stat() if self.path.is_file() else None
         stamp = (state.st_ino, state.st_size, state.st_mtime_ns) if state else ()
         if stamp and stamp == self._stamp:
@@ -122,9 +122,9 @@ class Collection:
 
     @classmethod
     def index(cls, folder: StrPath, path: StrPath, *, progress: bool = True) -> Collection:
-        """Bring an atlas up to date with the .ogpc files in a folder, and open it; `changes` says what was new.
+        """Bring an atlas up to date with the .ogpc files in a folder, and open it; `changes` lists what changed.
 
-        Arguments and errors as of `collection.index.index`.
+        Arguments and errors as in `collection.index.index`.
         """
         changes = index(folder, path, progress=progress)
         collection = cls(path)
@@ -138,11 +138,11 @@ class Collection:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """All words that some scene stores, sorted; an encoder may know more."""
+        """All words stored by any scene, sorted; an encoder may know more."""
         return tuple(sorted({word for group in self._groups for word in group.family.words}))
 
     def file(self, scene: str) -> Path:
-        """The .ogpc file of a scene, where it was when it was indexed."""
+        """The .ogpc file of a scene, at its path when it was indexed."""
         return self.root / f"{scene}.ogpc"
 
     def find(
@@ -154,15 +154,15 @@ class Collection:
         top: int = DEFAULT_TOP,
         text_features: TextFeatures = None,
     ) -> Findings:
-        """The instances that words fit best, of all scenes.
+        """The instances of all scenes that words fit best.
 
         words: looked up in text_features, then among the words of a scene's family (scenes of one encoder), else
-        encoded, if there is an encoder; or name -> vector (D,), which scenes of that width are asked. A scene that
-        cannot be asked for a word is left out, and ``not_asked`` says so.
-        within: two corners (3,); only instances whose box has its center between them, in their scene's world.
-        scenes: names, or patterns such as "site3/*". top: how many.
-        Raises OgPointcloudError where no scene can be asked, or a name or pattern fits none; FeatureSpaceError where
-        vectors fit none.
+        encoded, if there is an encoder; or name -> vector (D,), for scenes of that width. A scene that cannot be asked
+        for a word is left out, and ``not_asked`` says so.
+        within: two corners (3,); only instances whose box center lies between them, in their scene's world.
+        scenes: names, or patterns such as "site3/*". top: maximum number of findings.
+        Raises OgPointcloudError if no scene can be asked, or a name or pattern matches none; FeatureSpaceError if
+        vectors match none.
         """
         if not isinstance(top, Integral) or top < 1:
             raise OgPointcloudError(f"top is {top!r:.40}; expected a whole number, at least 1")
@@ -184,14 +184,14 @@ class Collection:
                 space = FeatureSpace(asked[0].family.feature_space, asked[0].family.width)
                 space.require(FeatureSpace(UNKNOWN_SPACE, given.vectors.shape[1]), "label vectors")
             raise _unanswerable(names[0], [group.family for group in asked])
-        # The best of each group and word, then the best of all: (what it is ranked by, finding).
+        # The best of each group and word, then the best of all: (sort key, finding).
         ranked = [
             pair
             for group, known in zip(asked, vectors, strict=True)
             for word, vector in known.items()
             for pair in self._best(group, query, word, vector)
         ]
-        ranked.sort(key=lambda pair: -pair[0])  # stable: of equals the first
+        ranked.sort(key=lambda pair: -pair[0])  # stable: the first one on ties
         # Scenes that could not be asked for a word, by word and feature space.
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
@@ -205,7 +205,7 @@ class Collection:
         return Findings((finding for _, finding in ranked[:top]), not_asked)
 
     def _ids(self, scenes: str | Iterable[str] | None) -> set[int] | None:
-        """Ids of the scenes of these names or patterns; None, for all, as it was given."""
+        """Ids of the scenes that names or patterns match; None, meaning all, stays None."""
         if scenes is None:
             return None
         ids: set[int] = set()
@@ -228,7 +228,8 @@ class Collection:
         features: tuple[Vocabulary, str] | None,
         given: Vocabulary | None,
     ) -> dict[str, NDArray[np.float32]]:
-        """Unit vectors of those words that these scenes can be asked for. given: by vectors, these alone."""
+        """Unit vectors of the words that these scenes can be asked for. given: vectors of the user, used
+        exclusively."""
         if given is not None:
             fits = given.vectors.shape[1] == family.width
             return dict(zip(given.names, unit_rows(given.vectors), strict=True)) if fits else {}
@@ -242,42 +243,40 @@ class Collection:
         return vectors
 
     def _encoder(self, family: Family) -> TextEncoder | None:
-        """The encoder that a scene of the family carries, else the one found for the feature space. That one is used
-        only where the space has one family here: of several it is not known which it is of."""
+        """The encoder that a scene of the family carries, else the one found for the feature space. The latter is used
+        only if the space has one family here: with several it is unknown which one it belongs to."""
         for entry in family.entries:
             if entry.encoder and (encoder := carried_encoder(self.file(entry.name))()):
                 return encoder
         of_space = {id(group.family) for group in self._groups if group.family.feature_space == family.feature_space}
         return find_encoder(family.feature_space) if len(of_space) == 1 else None
 
-    def _best(
-        self, group: Group, query: _Query, word: str, vector: NDArray[np.float32]
-    ) -> list[tuple[float, Finding]]:
-        """The best of a group for a word, with what they are ranked by."""
+    def _best(self, group: Group, query: _Query, word: str, vector: NDArray[np.float32]) -> list[tuple[float, Finding]]:
+        """The best of a group for a word, with their sort keys."""
         block = self._blocks.get(group.name) or self._block(group, query, vector)
-        # A block holds a whole group or more than was asked for: its ranking leaves the rest out.
-        asked = np.ones(len(block.entries), bool) if query.ids is None else np.isin(block.ids, list(query.ids))
+        # A block holds a whole group or more than was queried: its ranking leaves the rest out.
+        selected = np.ones(len(block.entries), bool) if query.ids is None else np.isin(block.ids, list(query.ids))
         words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))  # unit vectors
         rivals = words[words @ vector < SAME_WORD_COSINE]
-        ranked = zip(*block.rank(vector, rivals, asked, query.top, query.box), strict=True)
+        ranked = zip(*block.rank(vector, rivals, selected, query.top, query.box), strict=True)
         return [(key, _finding(block, row, word, float(sigmoid(key)))) for row, key in ranked]
 
     def _block(self, group: Group, query: _Query, vector: NDArray[np.float32]) -> Block:
-        """The scenes of a group that are asked and meet the box; of these only those that LanceDB proposes, if it is
-        used. A block of the whole group is kept for later questions, one of some scenes is read each time."""
+        """The queried scenes of a group that meet the box, reduced to those that LanceDB proposes, if it is used. A
+        block of the whole group is kept for later queries, one of some scenes is read each time."""
         here = query.scenes_of(group)
         with Atlas.reading(self.path) as atlas:
             ids = atlas.within(*query.box) if query.box is not None else {entry.id for entry in here}
-            near = [entry for entry in here if entry.id in ids] or here[:1]
-            is_all = len(near) == len(group.entries)
-            if self._lance is not None and (is_all or len(near) > MAX_EXACT_SCENES):
-                direction = load_block(atlas, near[:1]).direction(vector)
-                # Where all scenes are asked, the box alone is the condition: no list of ids is needed.
-                ids_asked = None if len(here) == len(group.entries) else [entry.id for entry in near]
-                part = len(near) / len(group.entries)
-                proposed = self._lance.propose(group.name, direction, query.box, ids_asked, query.top, part)
-                return load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
-            block = load_block(atlas, atlas.side_by_side(near))
+            candidates = [entry for entry in here if entry.id in ids] or here[:1]
+            is_all = len(candidates) == len(group.entries)
+            if self._lance is not None and (is_all or len(candidates) > MAX_EXACT_SCENES):
+                direction = load_block(atlas, candidates[:1]).direction(vector)
+                # When all scenes are queried, the box is the only condition: no list of ids is needed.
+                scene_ids = None if len(here) == len(group.entries) else [entry.id for entry in candidates]
+                part = len(candidates) / len(group.entries)
+                proposed = self._lance.propose(group.name, direction, query.box, scene_ids, query.top, part)
+                return load_block(atlas, [entry for entry in candidates if entry.id in proposed] or candidates[:1])
+            block = load_block(atlas, atlas.side_by_side(candidates))
         if is_all:
             self._blocks[group.name] = block
         return block
@@ -285,15 +284,15 @@ class Collection:
 
 @dataclass(frozen=True)
 class _Query:
-    """What may be found. ids: of the scenes asked, None for all. box: (2, 3) corners that the instance's middle must
-    lie between, None for anywhere. top: how many."""
+    """Filters of a query. ids: of the queried scenes, None for all. box: (2, 3) corners that the instance's center must
+    lie between, None for anywhere. top: maximum number of findings."""
 
     ids: set[int] | None
     box: NDArray[np.float64] | None
     top: int
 
     def scenes_of(self, group: Group) -> Sequence[SceneEntry]:
-        """Those scenes of a group in which it may lie."""
+        """The scenes of a group that are queried."""
         if self.ids is None:
             return group.entries
         return [group.by_id[id] for id in sorted(self.ids & group.by_id.keys())]

@@ -1,4 +1,4 @@
-"""Many captures -> a .ogpc file each, on any executor. One that fails, or dies, leaves the others alone."""
+"""Many captures -> a .ogpc file each, on any executor. One that fails or dies does not affect the others."""
 
 from __future__ import annotations
 
@@ -52,10 +52,9 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class CaptureFit:
-    """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
-    cause. worker: where, as host:process, or "lost". peak_bytes: the most memory that this process has held, 0 if
-    unknown. doubts: names of the checks that failed (the file's provenance says why). warnings: what else was to be
-    messages of it.
+    """Outcome of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the cause.
+    worker: host:process, or "lost". peak_bytes: peak memory of this process so far, 0 if unknown. doubts: names of the
+    checks that failed (the file's provenance says why). warnings: all other warnings.
 
     >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
     'kitchen'
@@ -87,18 +86,17 @@ def fit_many(
     options: FitOptions | None = None,
     progress: bool = True,
 ) -> tuple[CaptureFit, ...]:
-    """Fit captures, or one, each a task, to ``out``/NAME.ogpc, NAME being the last part of a capture's path.
+    """Fit one or more captures, each as a task, to ``out``/NAME.ogpc, NAME being the last part of a capture's path.
 
-    executor: any of `concurrent.futures`; None: processes of this machine. Of a Dask cluster it is
-    ``dask.distributed.Client(address).get_executor(pure=False)``: captures and ``out`` lie where its workers see them.
-    A task takes its share of the worker's memory and cores; `FitSettings.memory` is the most for each.
+    executor: any of `concurrent.futures`; None: processes on this machine. For a Dask cluster, use
+    ``dask.distributed.Client(address).get_executor(pure=False)``; its workers must see captures and ``out``.
+    A task takes its share of the worker's memory and cores; `FitSettings.memory` limits each.
 
-    Files that are there and whole are left as they are; fits that were killed resume after the views that they kept.
-    Returns what became of each, in the order given; nothing is raised for a capture that fails. Warnings come with the
-    capture's name. The files do not depend
-    on where and in what order they were made: they hold no times, which are in the returned records.
-    OgPointcloudError, before any work, for two captures of one name, and in a script that calls it at its top level
-    without an executor: its processes import the script, which would run once more in each.
+    Files that are there and whole are left as they are; killed fits resume after the views that they kept. Returns the
+    outcome of each, in the given order; nothing is raised for a capture that fails. Warnings name the capture. The
+    files do not depend on where and in what order they were made: they hold no times, which are in the returned
+    records. OgPointcloudError, before any work, for two captures of one name, and in a script that calls it at its top
+    level without an executor: its processes import the script, which would run once more in each.
 
     >>> og.fit_many([], "out")
     ()
@@ -108,7 +106,7 @@ def fit_many(
             "fit_many is called while one of its own processes imports this script; expected it, and all work of a "
             "script, below if __name__ == '__main__':"
         )
-    if isinstance(captures, (str, os.PathLike)):  # the letters of a path are no captures
+    if isinstance(captures, (str, os.PathLike)):  # do not iterate over the letters of a path
         captures = [captures]
     options, out = options or FitOptions(), Path(out).resolve()
     jobs = _outputs([Path(capture).resolve() for capture in captures], out)
@@ -128,7 +126,7 @@ def _fit_all(
     workers: Executor, todo: Mapping[Path, Path], options: FitOptions, progress: bool
 ) -> dict[Path, CaptureFit]:
     """Fit captures to their files. Those whose workers die are tried once more at the end, when there is more room."""
-    # Pools of the standard library share this machine; of any other executor the machines are not known.
+    # Pools of the standard library share this machine; the machines of other executors are unknown.
     at_once = getattr(workers, "_max_workers", None)
     share = Share() if at_once is None else Share.of_machine(at_once)
     fits: dict[Path, CaptureFit] = {}
@@ -158,7 +156,7 @@ def _submitted(workers: Executor, capture: Path, output: Path, options: FitOptio
 def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> CaptureFit:
     try:
         return future.result()
-    except Exception as error:  # of the executor: a task's own are in what it returns
+    except Exception as error:  # of the executor: a task returns its own
         cause = f"its worker died ({type(error).__name__}: {error!s:.160}); out of memory, or killed?"
         return CaptureFit(str(capture), str(output), "failed", cause, worker=LOST)
 
@@ -184,14 +182,14 @@ def _is_whole(path: Path) -> bool:
 
 
 def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> CaptureFit:
-    """The task: never raises, as not every error survives the way back from another process."""
+    """The task: never raises, as not every error survives the transfer from another process."""
     start, worker = time.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
     messages: list[str] = []
     try:
         with _recorded(messages):
             cloud = _fit(Path(capture), Path(output), options, share_here(share))
     except Exception as error:
-        # Our own errors, the system's and missing extras say what is wrong; of any other the kind is messages too.
+        # Our own errors, the system's and missing extras say what is wrong; for any other, its type is added.
         expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
         cause = str(error) if expected and str(error) else f"{type(error).__name__}: {error}"
         if isinstance(error, OSError) and error.filename:
@@ -207,13 +205,13 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
 
 @contextmanager
 def _recorded(messages: list[str]) -> Iterator[None]:
-    """Adds the warnings that a fit gives to ``told``, but for doubts, which its provenance has. Python cannot tell
-    apart those of several threads: in a thread they go where they always do."""
+    """Adds the warnings of a fit to ``messages``, except doubts, which its provenance has. Python cannot tell apart
+    those of several threads: in a thread they are issued as usual."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("ignore")  # what libraries tell programmers
+        warnings.simplefilter("ignore")  # those that libraries address to programmers
         warnings.simplefilter("always", UserWarning)
         try:
             yield
@@ -237,7 +235,7 @@ def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> Labe
 def fit_capture(
     capture: Path, options: FitOptions, *, work: Path | None, executor: Executor | None = None, progress: bool = False
 ) -> LabelledCloud:
-    """A capture's cloud with its words, not yet written. work, executor, progress: as of `fit`."""
+    """A capture's cloud with its words, not yet written. work, executor, progress: as in `fit`."""
     start = time.perf_counter()
     scene = read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
     space = FeatureSpace(scene.feature_space, scene.feature_width)
@@ -249,7 +247,7 @@ def fit_capture(
 
 
 def _reproducible(provenance: dict[str, Any], settings: FitSettings) -> dict[str, Any]:
-    """Provenance without what depends on where, when and beside what a fit ran: files are equal byte for byte."""
+    """Provenance without anything that depends on where, when and beside what a fit ran: files are reproducible."""
     return {
         **provenance,
         "settings": {**provenance["settings"], "memory": settings.memory},

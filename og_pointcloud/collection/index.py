@@ -3,10 +3,10 @@ it, which makes its scores comparable with those of others.
 
 Cosines of two scenes cannot be compared: one has 0.3 where a word fits, another, whose features come from a detector's
 words, 0.8 where it does not. A word bank makes them comparable (`ask.choosing`). A scene without one borrows that of
-another scene of its encoder, else all words that the scenes of its encoder know together.
+another scene of its encoder, else all words that the scenes of its encoder have together.
 
-The name of a feature space does not tell which scenes are of one encoder: somebody typed it. Scenes that give the same
-words different vectors are of two encoders (two families), and words of one are never asked of the other.
+The name of a feature space does not tell which scenes share an encoder: somebody typed it. Scenes with different
+vectors for the same words have two encoders (two families), and words of one are never used for the other.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ has about 0.9, in another encoder's space about 0."""
 
 @dataclass(frozen=True)
 class Changes:
-    """What indexing changed, by names of scenes. left_out: name and cause of each file that cannot be read; what the
-    atlas held of it before is removed."""
+    """Changes by indexing, as names of scenes. left_out: name and cause of each file that cannot be read; its previous
+    entry in the atlas is removed."""
 
     added: tuple[str, ...]
     replaced: tuple[str, ...]
@@ -55,8 +55,8 @@ class Changes:
 def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     """Bring an atlas up to date with all .ogpc files in a folder and the folders below.
 
-    path: of the atlas, which is made where there is none. OgPointcloudError where that is no folder, or holds no such
-    file, or the atlas cannot be written; it then stays as it was.
+    path: of the atlas, created if missing. OgPointcloudError if ``folder`` is no folder or holds no such file, or if
+    the atlas cannot be written; it then stays as it was.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -68,12 +68,12 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     with Atlas.writing(path) as atlas:
         atlas.note("root", str(root.resolve()))
         known = {entry.name: entry for entry in atlas.entries()}
-        others = [name for name, file in files.items() if name not in known or not _is_same(file, known[name])]
-        for name in with_bar(others, "index", len(others), progress):
+        outdated = [name for name, file in files.items() if name not in known or not _is_same(file, known[name])]
+        for name in with_bar(outdated, "index", len(outdated), progress):
             try:
                 if _add_file(atlas, name, files[name], known.get(name)):
                     (replaced if name in known else added).append(name)
-            except (OgPointcloudError, OSError) as error:  # one bad file does not cost the others
+            except (OgPointcloudError, OSError) as error:  # one bad file does not affect the others
                 left_out.append((name, str(error)))
                 atlas.remove(name)
         removed = sorted(set(known) - set(files))
@@ -85,13 +85,13 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
 
 
 def _is_same(file: Path, entry: SceneEntry) -> bool:
-    """Whether a file has the size and date that it had when it was indexed: then it is not even opened."""
+    """Whether a file has the same size and date as when it was indexed: then it is not even opened."""
     state = file.stat() if file.is_file() else None  # a link may lead nowhere
     return state is not None and (state.st_size, state.st_mtime_ns) == (entry.bytes, entry.modified)
 
 
 def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
-    """Put a .ogpc file into the atlas; False where only its date is new, not its content."""
+    """Add a .ogpc file to the atlas; False if only its date is new, not its content."""
     if not file.is_file():
         raise OgPointcloudError(f"{file} is no file; expected one")  # a device or a pipe never ends
     state = file.stat()
@@ -104,7 +104,7 @@ def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> 
     instances = list_instances(cloud, Chooser(cloud.instances))
     boxes = [instance.axis_aligned_box for instance in instances]
     corners = np.array([(box.low, box.high) if box else np.zeros((2, 3)) for box in boxes]).reshape(-1, 2, 3)
-    points = np.array([instance.points for instance in instances], np.int32)  # by the ids, whatever its table says
+    points = np.array([instance.points for instance in instances], np.int32)  # counted by id, whatever its table says
     table = replace(cloud.instances, descriptors=unit_rows(cloud.instances.descriptors), points=points)
     entry = SceneEntry(
         0, name, digest, cloud.feature_space, state.st_size, state.st_mtime_ns,
@@ -122,8 +122,8 @@ def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> 
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes of one encoder: their feature space and width are the same, and their words agree. words: all that they
-    know together, (D,) unit vectors; of a word that several know, the vector of the first scene by name."""
+    """Scenes of one encoder: they share feature space and width, and their words agree. words: of all scenes together,
+    (D,) unit vectors; for a word of several, the vector of the first scene by name."""
 
     feature_space: str
     width: int
@@ -131,16 +131,16 @@ class Family:
     words: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def groups(self) -> list[Group]:
-        """The scenes that can be asked, by the bank that judges them."""
-        alike: dict[str | None, list[SceneEntry]] = {}
+        """The scenes that can be queried, grouped by the bank that judges them."""
+        by_judge: dict[str | None, list[SceneEntry]] = {}
         for entry in self.entries if self.width else ():
-            alike.setdefault(entry.judge, []).append(entry)
-        return [Group(self, entries) for entries in alike.values()]
+            by_judge.setdefault(entry.judge, []).append(entry)
+        return [Group(self, entries) for entries in by_judge.values()]
 
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes of one family with the same bank, or all without: they are asked alike."""
+    """Scenes of one family with the same bank, or all without one: they are queried the same way."""
 
     family: Family
     entries: list[SceneEntry]
@@ -152,56 +152,56 @@ class Group:
 
     @property
     def name(self) -> str:
-        """Tells it from other groups of the atlas."""
+        """Unique among the groups of the atlas."""
         return f"{self.family.entries[0].id}-{self.entries[0].judge or 'cosine'}"
 
 
 def families(atlas: Atlas, entries: Iterable[SceneEntry]) -> list[Family]:
     """The scenes of an atlas by encoder.
 
-    A scene without words belongs to the family of its feature space where there is only one. Each scene of a space that
-    nobody named is a family of its own.
+    A scene without words belongs to the family of its feature space if there is only one. Each scene of an unnamed
+    space is its own family.
     """
-    alike: dict[tuple[str, int, str, int], list[SceneEntry]] = {}
+    by_words: dict[tuple[str, int, str, int], list[SceneEntry]] = {}
     for entry in entries:
         alone = entry.id if entry.feature_space == UNKNOWN_SPACE else 0
-        alike.setdefault((entry.feature_space, entry.width, entry.vocabulary or "", alone), []).append(entry)
+        by_words.setdefault((entry.feature_space, entry.width, entry.vocabulary or "", alone), []).append(entry)
     known: list[Family] = []
-    # Those with words first: they say which families there are.
+    # Those with words first: they define the families.
     for (space, width, digest, alone), members in sorted(
-        alike.items(), key=lambda item: (not item[0][2], item[1][0].name)
+        by_words.items(), key=lambda item: (not item[0][2], item[1][0].name)
     ):
-        own = _words(atlas, digest, width)
+        words = _words(atlas, digest, width)
         of_space = [] if alone else [each for each in known if (each.feature_space, each.width) == (space, width)]
-        fitting = [family for family in of_space if _agree(own, family.words)]
-        # Scenes without words agree with any family: where there are several, they are none of them for sure.
-        if not fitting or (not own and len(of_space) > 1):
+        fitting = [family for family in of_space if _agree(words, family.words)]
+        # Scenes without words agree with any family: if there are several, it is unknown which one is theirs.
+        if not fitting or (not words and len(of_space) > 1):
             fitting = [Family(space, width)]
             known += fitting
         family = fitting[0]
         family.entries.extend(members)
-        family.words.update({**own, **family.words})
+        family.words.update({**words, **family.words})
     return known
 
 
 def _words(atlas: Atlas, digest: str, width: int) -> dict[str, NDArray[np.float32]]:
-    """A vocabulary, name -> unit vector; nothing where it has another width than the descriptors."""
+    """A vocabulary, name -> unit vector; empty if its width differs from the descriptors'."""
     words = atlas.words(digest) if digest else None
     return dict(zip(words.names, words.vectors, strict=True)) if words and words.vectors.shape[1] == width else {}
 
 
 def _agree(first: Mapping[str, NDArray[np.float32]], second: Mapping[str, NDArray[np.float32]]) -> bool:
-    """Whether the words that both know have about the same unit vectors; true where they share none."""
+    """Whether the words that both have share about the same unit vectors; true if they have none in common."""
     shared = first.keys() & second.keys()
     return not shared or float(np.mean([first[name] @ second[name] for name in shared])) > SAME_ENCODER_COSINE
 
 
 def judge_scenes(atlas: Atlas) -> None:
-    """Choose the word bank that judges each scene, and judge the scenes for which it is another than before."""
+    """Choose the word bank that judges each scene, and judge the scenes whose bank has changed."""
     for family in families(atlas, atlas.entries()):
         lent = _lent_bank(atlas, family)
         banks: dict[str, WordBank] = {}
-        # Scenes of one bank one after the other: it is read once, and only one is held at a time.
+        # Scenes of one bank in sequence: each bank is read once, and only one is held at a time.
         for entry in sorted(family.entries, key=lambda entry: entry.bank or ""):
             judge = (entry.bank or lent) if family.width else None
             if judge == entry.judge:
@@ -216,7 +216,7 @@ def judge_scenes(atlas: Atlas) -> None:
 
 
 def _lent_bank(atlas: Atlas, family: Family) -> str | None:
-    """Digest of the bank for scenes that have none: the one that most of their family have, else the family's words."""
+    """Digest of the bank for scenes without one: that of most scenes of their family, else the family's words."""
     if banks := [entry.bank for entry in family.entries if entry.bank]:
         return max(sorted(set(banks)), key=banks.count)
     if len(family.words) < MIN_BANK or family.width == 0:

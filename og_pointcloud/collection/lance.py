@@ -1,9 +1,9 @@
 """LanceDB beside an atlas (extra 'lance'): for more descriptors than memory holds, in a folder or an object store.
 
-A table has a row for each descriptor: its vector and shift (`scoring.Block`), whose inner product with (direction, 1)
-is the evidence itself. The largest products are therefore the best instances, also among scenes that are judged
-differently. LanceDB only proposes: what it finds is scored from the atlas. An answer may lack an instance, but what it
-says of one is what the exact search says.
+A table has a row per descriptor: its vector and shift (`scoring.Block`), whose inner product with (direction, 1) is the
+evidence itself. So the largest products are the best instances, even among scenes that are judged differently. LanceDB
+only proposes: what it finds is scored from the atlas. An answer may miss an instance, but the scores are those of the
+exact search.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from og_pointcloud.errors import OgPointcloudError, naming_extra
 from og_pointcloud.formats.atomic import StrPath
 
 MIN_INDEXED_ROWS = 50_000
-"""Rows from which a table has an index; of fewer every one is compared."""
+"""Rows from which on a table gets an index; with fewer, all are compared."""
 ROWS_PER_PARTITION = 4_000
 SCENES_PER_WRITE = MAX_EXACT_SCENES = 200
-"""Scenes written at once; and scenes up to which the atlas is asked, exactly: their rows lie in all partitions."""
+"""Scenes written at once; and scenes up to which the atlas is searched exactly: their rows lie in all partitions."""
 PROPOSED_ROWS = 50
-"""Rows proposed for each instance wanted: a row's rank by evidence is not yet its rank by probability."""
+"""Rows proposed per requested instance: a row's rank by evidence is not yet its rank by probability."""
 SEARCHED_PARTITIONS, REFINE_FACTOR = 64, 8
-"""Partitions that are searched, and how many times the rows asked for are compared in full precision: recall against
-time. On 200,000 made descriptors the recall at 10 was 1.00; with 24 and 4 it was 0.97 (docs/scale.md)."""
+"""Partitions searched, and multiple of the requested rows compared in full precision: recall against time. On 200,000
+synthetic descriptors the recall at 10 was 1.00; with 24 and 4 it was 0.97 (docs/scale.md)."""
 
 
 def _database(uri: str) -> Any:
@@ -41,7 +41,7 @@ def _database(uri: str) -> Any:
 
 
 def write_lance(atlas: StrPath, uri: str) -> None:
-    """Write all that an atlas has to the database at a folder or URI (s3://...), in place of what is there."""
+    """Write a whole atlas to the database at a folder or URI (s3://...), replacing what is there."""
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
     database = _database(uri)
@@ -64,7 +64,7 @@ def write_lance(atlas: StrPath, uri: str) -> None:
 
 
 def _name(uri: str) -> str:
-    """Under which an atlas notes what of it is there."""
+    """The name under which an atlas notes the fingerprint written to this database."""
     return f"lance {uri if '://' in uri else os.path.abspath(uri)}"
 
 
@@ -87,7 +87,7 @@ class LanceTables:
         self._uri, self._database = uri, _database(uri)
 
     def require(self, atlas: Atlas) -> None:
-        """OgPointcloudError where these are not all scenes of an atlas, as they are now: new ones would be missed."""
+        """OgPointcloudError unless these hold all scenes of an atlas as they are now: new ones would be missed."""
         if atlas.noted(_name(self._uri)) != atlas.fingerprint:
             raise OgPointcloudError(
                 f"'{self._uri}' was not written from {atlas.path} as it is now: write it again with "
@@ -105,9 +105,9 @@ class LanceTables:
     ) -> set[int]:
         """Ids of the scenes whose descriptors have the most evidence for a direction (D,).
 
-        name: of the group. box: (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked;
-        None for all. share: roughly what share of the rows box and scenes leave: the fewer they are, the more
-        partitions must be searched for the best of them.
+        name: of the group. box: (2, 3) corners that the instances' centers must lie between. scenes: their ids; None
+        for all. share: approximate share of the rows that pass box and scenes: the fewer, the more partitions must be
+        searched for the best of them.
         """
         try:
             table = self._database.open_table(name)

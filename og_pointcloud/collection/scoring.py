@@ -1,9 +1,9 @@
-"""The instances of many scenes against one text: the best of them, exactly, without scoring each to the end.
+"""The best instances of many scenes for one text, exactly, without fully scoring each.
 
-An instance's evidence is one inner product for each descriptor, scaled and shifted (`choosing.Standard`), so one pass
-over the descriptors gives all of it. Its probability also depends on what other words of the bank say, which is a
-hundred times the work; but evidence alone bounds it from above. So instances are scored in the order of their bounds,
-until no other can reach the places that are selected for.
+An instance's evidence is one inner product per descriptor, scaled and shifted (`choosing.Standard`), so one pass over
+the descriptors gives all of it. Its probability also depends on the other words of the bank, which is a hundred times
+the work; but evidence alone bounds it from above. So instances are scored in the order of their bounds, until no other
+can be among the best.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4), as
 in its released code; the paper gives none."""
 ROWS_PER_BATCH = 512
-"""Instances whose descriptors are gathered for one product: few enough to stay in a core's cache."""
+"""Instances whose descriptors are gathered for one matrix product: few enough to stay in a core's cache."""
 FIRST_SCORED = 64
-"""Instances scored to the end at first; then four times as many each time, until it is enough."""
+"""Instances fully scored at first; then four times as many each time, until it is enough."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """S scenes that are selected alike: of one encoder, and judged by one word bank or by none. I instances, those with
-    a point and a descriptor, scene after scene.
+    """S scenes of one encoder, judged by one word bank or by none, with their I instances that have a point and a
+    descriptor, scene after scene.
 
-    vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
-    descriptor in standard deviations of the judge's words; without a judge the cosine. bounds: (I + 1,) where each
-    instance's descriptors begin, and where the last one's end. scene, instance: (I,) row of ``entries``, and id in the
-    scene. points: (I,). center, size: (I, 3) of the boxes. bank: the judge, None for none. sharpness: (S,) float64 of
-    the scenes (`choosing.Standard`), none without a judge.
+    vectors: (R, D) float32, shift: (R,) float32; the product of a vector with a `direction`, plus its shift, is the
+    evidence of a descriptor in standard deviations of the judge's words; without a judge, the cosine. bounds: (I + 1,)
+    where each instance's descriptors begin, and the end of the last. scene, instance: (I,) row of ``entries``, and id
+    in the scene. points: (I,). center, size: (I, 3) of the boxes. bank: the judge, or None. sharpness: (S,) float64 of
+    the scenes (`choosing.Standard`), empty without a judge.
     """
 
     entries: tuple[SceneEntry, ...]
@@ -60,28 +60,28 @@ class Block:
 
     @cached_property
     def ids(self) -> NDArray[np.int64]:
-        """(S,) of the scenes in their atlas."""
+        """(S,) ids of the scenes in their atlas."""
         return np.array([entry.id for entry in self.entries], np.int64)
 
     @cached_property
     def _starts(self) -> NDArray[np.intp]:
-        """(S + 1,) where each scene's instances begin, and where the last one's end."""
+        """(S + 1,) where each scene's instances begin, and the end of the last."""
         return np.searchsorted(self.scene, np.arange(len(self.entries) + 1))
 
     @cached_property
     def _center_bounds(self) -> DoubleArray:
-        """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; infinite, which meets no box,
-        for a scene without any."""
-        reach = np.full((len(self.entries), 2, 3), np.inf)
+        """(S, 2, 3) low and high corner around the centers of a scene's instances; infinite, which meets no box, for a
+        scene without any."""
+        bounds = np.full((len(self.entries), 2, 3), np.inf)
         held = np.flatnonzero(np.diff(self._starts))  # reduceat takes no empty runs
         for corner, least in enumerate((np.minimum, np.maximum) if len(held) else ()):
-            reach[held, corner] = least.reduceat(self.center, self._starts[held])
-        return reach
+            bounds[held, corner] = least.reduceat(self.center, self._starts[held])
+        return bounds
 
     @cached_property
     def _logit_bound(self) -> DoubleArray:
         """(2, I) factor and summand: the logit of an instance's score is at most factor * evidence + summand."""
-        # `_relevancy` and `_log_odds` with the least that rivals can say: a cosine of -1, and what chance gives.
+        # `_relevancy` and `_log_odds` with the lowest possible scores of rivals: a cosine of -1, and that of chance.
         if self.bank is None:
             return np.full((2, len(self)), RELEVANCY_TEMPERATURE)
         sharpness = self.sharpness[self.scene]
@@ -89,20 +89,20 @@ class Block:
 
     @cached_property
     def _bank_words(self) -> tuple[FloatArray, FloatArray]:
-        """(D,) what the words of the bank share, and (B, D) unit rows of what they do not."""
+        """(D,) mean of the bank's words, and (B, D) unit rows of their deviations from it."""
         assert self.bank is not None
         return self.bank.mean, unit_rows(self.bank.vectors - self.bank.mean)
 
     def meets(self, box: DoubleArray) -> NDArray[np.bool_]:
-        """(S,) whether a scene may have an instance with its middle in a box (2, 3)."""
+        """(S,) whether a scene may have an instance with its center in a box (2, 3)."""
         return ((self._center_bounds[:, 0] <= box[1]) & (self._center_bounds[:, 1] >= box[0])).all(axis=1)
 
     def direction(self, text: FloatArray) -> FloatArray:
-        """(D,) unit vector of a text (D,) whose products with the vectors say how it fits."""
+        """(D,) unit vector of a text (D,) whose products with the vectors measure its fit."""
         return unit_rows(text if self.bank is None else unit_rows(text) - self._bank_words[0]).astype(np.float32)
 
     def evidence(self, rows: NDArray[np.intp], directions: FloatArray) -> FloatArray:
-        """(n, L) of these instances for directions (L, D): of several descriptors the best."""
+        """(n, L) evidence of instances for directions (L, D): the maximum over an instance's descriptors."""
         best = np.empty((len(rows), len(directions)), np.float32)
         for start in range(0, len(rows), ROWS_PER_BATCH):
             part = rows[start : start + ROWS_PER_BATCH]
@@ -112,8 +112,8 @@ class Block:
         return best
 
     def _best_of(self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: FloatArray) -> FloatArray:
-        """(n, L) each instance's most evidence. rows: of descriptors, instance after instance; first: (n,) where each
-        instance's begin among them."""
+        """(n, L) maximum evidence of each instance. rows: of descriptors, instance after instance; first: (n,) where
+        each instance begins among them."""
         scores = self.vectors[rows] @ directions.T
         scores += self.shift[rows, None]
         return scores if len(first) == len(scores) else np.maximum.reduceat(scores, first, axis=0)
@@ -126,11 +126,11 @@ class Block:
         top: int,
         box: DoubleArray | None = None,
     ) -> tuple[NDArray[np.intp], DoubleArray]:
-        """The best ``top`` instances of scenes for a text (D,), of equals the first, and the logit of their scores.
+        """The best ``top`` instances of scenes for a text (D,), the first ones on ties, and the logits of their scores.
 
-        selected: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
-        With a judge the score is the probability that the instance is what the text says, as `og.select` has it
-        against no other word. Without, it is LERF's relevancy against rivals (M, D), unit rows.
+        selected: (S,) bool, scenes. box: (2, 3) corners that the instances' centers must lie between.
+        With a judge, the score is the probability that the instance is what the text says, as in `og.select` with no
+        other word. Without, it is LERF's relevancy against rivals (M, D), unit rows.
         """
         if box is not None:
             selected = selected & self.meets(box)
@@ -151,21 +151,22 @@ class Block:
         return rows[best], key
 
     def _bounds_of(self, begin: int, end: int, direction: FloatArray) -> DoubleArray:
-        """(end - begin,) bounds of the scores of neighboring instances for a direction (1, D)."""
+        """(end - begin,) upper bounds of the logits of consecutive instances for a direction (1, D)."""
         rows = slice(*self.bounds[[begin, end]].tolist())
         evidence = self._best_of(rows, self.bounds[begin:end] - rows.start, direction)[:, 0]
         factor, summand = self._logit_bound[:, begin:end]
         return factor * evidence + summand
 
     def _outside(self, selected: NDArray[np.bool_], box: DoubleArray) -> NDArray[np.intp]:
-        """The instances of scenes that have their middles outside of a box; only scenes that it cuts have any."""
+        """The instances of scenes with their centers outside a box; only scenes that it cuts have any."""
         is_cut = selected & ((self._center_bounds[:, 0] < box[0]) | (self._center_bounds[:, 1] > box[1])).any(axis=1)
         rows = _ranges(self._starts[:-1][is_cut], self._starts[1:][is_cut])
-        middle = self.center[rows]
-        return rows[((middle < box[0]) | (middle > box[1])).any(axis=1)]
+        center = self.center[rows]
+        return rows[((center < box[0]) | (center > box[1])).any(axis=1)]
 
     def _relevancy(self, rows: NDArray[np.intp], direction: FloatArray, rivals: FloatArray) -> DoubleArray:
-        """Logit of how much better a direction (1, D) fits than the best rival; without rivals, than nothing at all."""
+        """Logit of the relevancy of a direction (1, D) against the best rival; without rivals, against a cosine of
+        0."""
         cosine = self.evidence(rows, np.concatenate([direction, rivals])).astype(np.float64)
         return RELEVANCY_TEMPERATURE * (cosine[:, 0] - (cosine[:, 1:].max(axis=1) if len(rivals) else 0))
 
@@ -185,9 +186,9 @@ def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp
 def largest(
     bound: DoubleArray, key_of: Callable[[NDArray[np.intp]], DoubleArray], top: int
 ) -> tuple[NDArray[np.intp], DoubleArray]:
-    """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are selected for.
+    """The ``top`` indices with the largest keys, the first ones on ties, and their keys; computes few of the keys.
 
-    bound: (n,) what the keys do not exceed; places of -inf are none. key_of: the keys of some places.
+    bound: (n,) upper bounds of the keys; -inf excludes an index. key_of: the keys of some indices.
     """
     known, key, count = np.zeros(0, np.intp), np.zeros(0), FIRST_SCORED + top
     while True:
@@ -195,7 +196,7 @@ def largest(
         tried = tried[bound[tried] > -np.inf]
         new = np.setdiff1d(tried, known, assume_unique=True)
         known, key = np.append(known, new), np.append(key, key_of(new))
-        # Done when all were tried, or no bound that is left can beat the last key that is wanted.
+        # Done when all were tried, or no remaining bound can beat the last key needed.
         if len(tried) < count or np.partition(key, -top)[-top] >= bound[tried].min():
             order = np.lexsort((known, -key))[:top]
             return known[order], key[order]
@@ -219,7 +220,7 @@ def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
         shown = np.flatnonzero(table.points[owner] > 0)  # an instance without points cannot be found
         rows, shift = table.descriptors[shown], np.zeros(len(shown), np.float32)
         if entry.judge is not None:
-            # Evidence is scale * ((descriptor - common) @ direction) + shift: all but the direction is done here.
+            # Evidence is scale * ((descriptor - common) @ direction) + shift: all but the direction is applied here.
             standard = atlas.judgement(entry, len(owner))
             rows, shift = standard.scale[shown, None] * (rows - standard.common), standard.shift[shown]
             sharpness.append(standard.sharpness)

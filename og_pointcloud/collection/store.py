@@ -1,12 +1,11 @@
-"""The atlas: what is known of the instances of many scenes, in one SQLite file. It is read without being believed.
+"""The atlas: what is known about the instances of many scenes, in one SQLite file. Its content is read as untrusted.
 
     scenes      a row each: name, hash of its file, feature space; arrays of its instances and descriptors
-    words       vocabularies and word banks, each once, however many scenes share them, by a hash of their content
-    judgements  by which words a scene's instances are judged, and what that makes of its descriptors (`Standard`)
+    words       vocabularies and word banks by a hash of their content, each once, however many scenes share them
+    judgements  the words that a scene's instances are judged by, and the resulting `Standard` of its descriptors
     boxes       an R*Tree of the boxes of scenes
 
-A change is one transaction: whoever reads sees the atlas before it or after it, and a process that is killed leaves
-the one before.
+A change is one transaction: a reader sees the atlas before it or after it, and a killed process leaves the one before.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath, replacing
 
 APPLICATION_ID, VERSION = 0x4F474154, 2
-"""SQLite's application_id ("OGAT") and user_version; the second is raised when older atlases cannot be read."""
+"""SQLite's application_id ("OGAT") and user_version; the latter is raised when older atlases become unreadable."""
 SCHEMA = (
     "CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL)",
     "CREATE TABLE scenes(id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, digest TEXT NOT NULL, "
@@ -50,19 +49,19 @@ INSTANCE_RECORD = np.dtype([
     ("points", "<i4"), ("views", "<i4"), ("masks", "<i4"), ("part_of", "<i4"), ("agreement", "<f4"),
     ("visible_area", "<f4"), ("box", "<f8", (2, 3)),
 ])  # fmt: skip
-"""What an atlas knows of an instance: columns of its `InstanceTable`, and the low and high corner of the axis-aligned
-box of its main part, in the scene's unit, 0 where it has no points."""
+"""Record of an instance: columns of its `InstanceTable`, and the low and high corner of the axis-aligned box of its
+main part, in the scene's unit, 0 where it has no points."""
 LOCK_TIMEOUT_S = 30.0
-"""How long a change waits for another one."""
+"""Seconds that a change waits for another one to finish."""
 
 
 @dataclass(frozen=True)
 class SceneEntry:
     """A scene without its arrays. name: its file's path below the folder that was indexed, without the ending.
 
-    digest, bytes, modified: of the file. feature_space, width: of its descriptors. encoder: 1 where the file carries a
-    text encoder. vocabulary, bank: digests in `words`, None without. judge: digest of the bank by which its instances
-    are judged, None without. instances, numbers: how many, and how many numbers their descriptors are.
+    digest, bytes, modified: of the file. feature_space, width: of its descriptors. encoder: 1 if the file carries a
+    text encoder. vocabulary, bank: digests in `words`, or None. judge: digest of the bank that its instances are judged
+    by, or None. instances: their number; numbers: number of float32 values of their descriptors.
     """
 
     id: int
@@ -103,8 +102,8 @@ class Atlas:
     @classmethod
     @contextmanager
     def writing(cls, path: StrPath) -> Iterator[Atlas]:
-        """For one change, which takes effect when the block ends without an error. A missing file is made beside its
-        place and moved there at the end: of two processes that make it at a time, the last to end has made it."""
+        """For one change, which takes effect if the block ends without an error. A missing file is created beside its
+        path and moved there at the end: if two processes create it at once, the last one to end wins."""
         path = Path(path)
         if path.exists() and not (path.is_file() and path.stat().st_size == 0):
             with cls._connected(path, "rw") as atlas:
@@ -115,7 +114,9 @@ class Atlas:
             return
         marks = (f"PRAGMA application_id = {APPLICATION_ID}", f"PRAGMA user_version = {VERSION}")
         with replacing(path) as file, cls._connected(path, "rw", Path(file.name)) as atlas:
-            path.with_name(f"{path.name}-journal").unlink(missing_ok=True)  # of one that is no more: it would be undone
+            path.with_name(f"{path.name}-journal").unlink(
+                missing_ok=True
+            )  # of a deleted atlas: it would be rolled back
             for statement in ("PRAGMA journal_mode = MEMORY", "BEGIN IMMEDIATE", *SCHEMA, *marks):
                 atlas._run(statement)
             yield atlas
@@ -124,29 +125,29 @@ class Atlas:
     @classmethod
     @contextmanager
     def _connected(cls, path: Path, mode: str, file: Path | None = None) -> Iterator[Atlas]:
-        """file: where it lies until it takes its place."""
+        """file: its path until it is moved to ``path``."""
         uri = f"{(file or path).resolve().as_uri()}?mode={mode}"
         try:
             with closing(sqlite3.connect(uri, uri=True, timeout=LOCK_TIMEOUT_S, isolation_level=None)) as connection:
-                # What SQLite advises for a file that may be hostile (sqlite.org/security.html).
+                # Recommended by SQLite for untrusted files (sqlite.org/security.html).
                 connection.execute("PRAGMA trusted_schema = OFF")
                 connection.execute("PRAGMA cell_size_check = ON")
-                yield cls(path, connection)  # what is not committed when it is closed is undone
+                yield cls(path, connection)  # uncommitted changes are rolled back when it is closed
         except (sqlite3.Error, UnicodeDecodeError) as error:  # an error may quote bytes of the file
             raise _explained(path, str(error)) from None
 
     def _check(self) -> None:
-        """Refuse other databases, and those with views, triggers or columns that none of ours has."""
+        """Refuse other databases, and those with views, triggers or columns that ours do not have."""
         marks = tuple(self._run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
         if marks != (APPLICATION_ID, VERSION):
             raise _refused(self.path, f"its application and version are {marks}; expected {(APPLICATION_ID, VERSION)}")
-        # SQLite keeps the text of each CREATE. Indices that it makes by itself have none; the R*Tree's own tables,
-        # boxes_*, have texts of its own.
+        # SQLite keeps the text of each CREATE. Its automatic indices have none; the R*Tree's internal tables, boxes_*,
+        # have their own.
         query = "SELECT sql FROM sqlite_master WHERE sql <> '' AND NOT (type = 'table' AND name GLOB 'boxes_*')"
         if others := {row[0] for row in self._run(query)} ^ set(SCHEMA):
             raise _refused(self.path, f"its schema has, or lacks, {min(map(str, others)):.80}")
 
-    # What it holds: records are checked when they are made, so what they refuse the file should not have held ------
+    # Reading: records are checked when they are constructed; what they refuse should not have been in the file -----
 
     @property
     def root(self) -> Path:
@@ -154,13 +155,13 @@ class Atlas:
         return Path(self.noted("root"))
 
     def noted(self, name: str) -> str:
-        """What `note` wrote under a name, "" where it wrote nothing."""
+        """The text that `note` stored under a name, "" if none."""
         row = self._run("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
         return str(row[0]) if row else ""
 
     @property
     def fingerprint(self) -> str:
-        """Another one whenever scenes, their contents or their judges are others."""
+        """Changes whenever scenes, their contents or their judges change."""
         query = "SELECT id, digest, judge FROM scenes LEFT JOIN judgements ON scene = id ORDER BY id"
         return blake2b(repr(self._run(query).fetchall()).encode(), digest_size=16).hexdigest()
 
@@ -184,7 +185,7 @@ class Atlas:
             return table, _finite(rows["box"])
 
     def judgement(self, entry: SceneEntry, rows: int) -> Standard:
-        """What its judge makes of a scene's descriptors. rows: how many it has."""
+        """The `Standard` of a scene's descriptors under its judge. rows: their number."""
         statement = "SELECT sharpness, standard FROM judgements WHERE scene = ?"
         with self._refusing_damage(f"the judgement of '{entry.name}'"):
             sharpness, blob = self._run(statement, (entry.id,)).fetchone()
@@ -218,7 +219,7 @@ class Atlas:
         places = {id: place for id, *place in rows}
         twice = np.array([places.get(entry.id, [0, 0, 0]) for entry in entries], float).reshape(-1, 3)
         extent = np.ptp(twice, axis=0).max(initial=0) or 1.0
-        # Middles (twice them: only the order counts) in 2^10 cells a side; the bits of x, y and z take turns.
+        # Centers (times two: only the order matters) in 2^10 cells per side; the bits of x, y and z are interleaved.
         cells = ((twice - twice.min(axis=0)) / extent * (2**10 - 1)).astype(np.int64)
         code = sum((cells[:, axis] >> bit & 1) << 3 * bit + axis for bit in range(10) for axis in range(3))
         return [entries[row] for row in np.argsort(code, kind="stable")]
@@ -230,14 +231,15 @@ class Atlas:
         except (OgPointcloudError, ValueError, TypeError, OverflowError, RecursionError) as error:
             raise _refused(self.path, f"{what}: {error}") from None
 
-    # What changes -------------------------------------------------------------------------------------------------
+    # Writing ----------------------------------------------------------------------------------------------------
 
     def note(self, name: str, value: str) -> None:
-        """Remember a text: under "root", the folder that is indexed."""
+        """Store a text under a name; "root" is the indexed folder."""
         self._run("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, value))
 
     def add(self, entry: SceneEntry, table: InstanceTable, boxes: NDArray[np.float64]) -> None:
-        """A scene, in place of one of the same name. Its id is given here, its judgement later. boxes: (K, 2, 3)."""
+        """Add a scene, replacing one of the same name. Its id is assigned here, its judgement later. boxes: (K, 2,
+        3)."""
         self.remove(entry.name)
         rows = np.zeros(len(table), INSTANCE_RECORD)
         for name in INSTANCE_RECORD.names or ():
@@ -267,14 +269,14 @@ class Atlas:
         return digest
 
     def judge(self, entry: SceneEntry, judge: str | None, made: Standard | None) -> None:
-        """Give a scene another judge, and what that makes of its descriptors; None for none."""
+        """Replace a scene's judge and the resulting `Standard` of its descriptors; None for none."""
         self._run("DELETE FROM judgements WHERE scene = ?", (entry.id,))
         if made is not None:
             blob = np.concatenate([made.common, made.scale, made.shift]).astype("<f4").tobytes()
             self._run("INSERT INTO judgements VALUES (?, ?, ?, ?)", (entry.id, judge, made.sharpness, blob))
 
     def forget_unused_words(self) -> None:
-        """Remove words that no scene needs any more."""
+        """Remove words that no scene needs anymore."""
         used = "SELECT vocabulary FROM scenes UNION SELECT bank FROM scenes UNION SELECT judge FROM judgements"
         self._run(f"DELETE FROM words WHERE digest IN (SELECT digest FROM words EXCEPT SELECT * FROM ({used}))")
 
@@ -290,7 +292,7 @@ def _finite(values: Any) -> Any:
 
 
 def _explained(path: Path, reason: str) -> OgPointcloudError:
-    """An error of SQLite in words that say what to do."""
+    """An SQLite error, reworded to say what to do."""
     if "locked" in reason:
         return OgPointcloudError(f"{path} is being changed by another process; wait for it, then try again")
     if "unable to open" in reason:

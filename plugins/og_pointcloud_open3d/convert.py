@@ -23,24 +23,24 @@ DEBIAN_LIBRARIES = "libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
 
 
 class Segmented(NamedTuple):
-    """cloud: a copy of what was given, of the same kind, painted. result: the labels, row by row of its points."""
+    """cloud: a painted copy of the input, of the same kind. result: the labels, row i for point i."""
 
     cloud: Any
     result: Segmentation
 
 
 def read(path: StrPath) -> Any:
-    """Open3D's tensor cloud of a file, Gaussians with their attributes.
+    """A file as Open3D's tensor cloud, Gaussians with their attributes.
 
-    SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read;
-    and for a damaged PLY or PCD, for which it returns uninitialized memory.
+    SceneError where Open3D would return an empty cloud and a warning (no file, no points, unreadable), and for a
+    damaged PLY or PCD, for which it returns uninitialized memory.
     """
     host, path = open3d(), Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a point cloud")
     if path.suffix.lower() in (".ply", ".pcd"):
-        world_points(path)  # which raises for the damaged ones
-    with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below says it
+        world_points(path)  # raises for damaged ones
+    with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below covers it
         cloud = host.t.io.read_point_cloud(str(path))
     if cloud.is_empty():
         raise SceneError(
@@ -55,11 +55,11 @@ def segment(
 ) -> Segmented:
     """Label a cloud, or a mesh by its vertices, and paint a copy of it.
 
-    pcd: Open3D's PointCloud or TriangleMesh, legacy or tensor, on any device, in the scene's world coordinates. What
-    comes back is of the same kind with all its attributes; its colors are the labels', gray where unknown. A tensor
-    geometry has og_label, og_instance (int32), og_score (float32) and og_reason (uint8) too, (N, 1) each, as Open3D's
-    own filters want them.
-    Other arguments: as for ``og_pointcloud.segment``. Raises as that, and SceneError for an empty cloud.
+    pcd: Open3D's PointCloud or TriangleMesh, legacy or tensor, on any device, in the scene's world coordinates. The
+    result is of the same kind with all its attributes; its colors are the labels', gray where unknown. A tensor
+    geometry also has og_label, og_instance (int32), og_score (float32) and og_reason (uint8), (N, 1) each, as Open3D's
+    own filters require.
+    Other arguments and errors: as for ``og_pointcloud.segment``; SceneError for an empty cloud too.
     """
     if len(world_points(pcd)) == 0:
         raise SceneError(
@@ -81,7 +81,7 @@ def to_open3d(result: Segmentation) -> Any:
 
 
 def _painted(pcd: Any, result: Segmentation) -> Any:
-    """A copy of any of the four kinds, with the result's colors, and its attributes where they can be kept."""
+    """A copy of any of the four kinds with the result's colors, and with its attributes if the kind supports them."""
     host = open3d()
     colors = result.colors / 255
     if isinstance(pcd, host.geometry.PointCloud):
@@ -115,7 +115,7 @@ def _set_attributes(tensors: Any, result: Segmentation, device: Any) -> None:
 
 
 def open3d() -> Any:
-    """Open3D. MissingExtraError where it is not installed, OgPointcloudError where it is too old or cannot load."""
+    """The module. MissingExtraError if Open3D is not installed, OgPointcloudError if it is too old or does not load."""
     try:
         module = importlib.import_module("open3d")
     except ModuleNotFoundError as error:

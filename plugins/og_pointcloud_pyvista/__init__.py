@@ -1,4 +1,4 @@
-"""og_pointcloud in PyVista, through its entry points: nothing to import, the names are there once both are installed.
+"""og_pointcloud in PyVista, through its entry points: no import needed once both are installed.
 
     import pyvista as pv
 
@@ -12,7 +12,7 @@
     plotter.og.enable_click_query()                       # click: the instance, its best words and scores
     plotter.show()
 
-A file a subject: ``datasets`` (what ``mesh.og`` does), ``plotting`` (what ``plotter.og`` does), ``files`` (.ogpc).
+One file per subject: ``datasets`` (what ``mesh.og`` does), ``plotting`` (what ``plotter.og`` does), ``files`` (.ogpc).
 """
 
 from og_pointcloud_pyvista.datasets import OgDataSet, to_pyvista

@@ -2,7 +2,7 @@
 
 Point arrays: og_label (int32, row of og_names, -1 unknown), og_instance (int32, the scene's id, negative for none),
 og_score (float32), og_reason (uint8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
-Labels are of points. For labels of cells, by the majority of their points, call
+Labels belong to points. For labels of cells, by majority of their points, call
 ``mesh.point_data_to_cell_data(categorical=True)``.
 """
 
@@ -27,7 +27,7 @@ from og_pointcloud.text.words import Labels, TextFeatures
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
-"""Pairs of numbers of `Box.corners`: the two ends of an edge differ in one bit, one axis."""
+"""Pairs of indices into `Box.corners`: the two ends of an edge differ in one bit, that is one axis."""
 
 
 def to_pyvista(result: Segmentation) -> pv.PolyData:
@@ -39,10 +39,10 @@ def to_pyvista(result: Segmentation) -> pv.PolyData:
 
 @pv.register_dataset_accessor("og", pv.DataSet)
 class OgDataSet:
-    """``mesh.og``: ask what the points of any dataset are, by words.
+    """``mesh.og``: query the points of any dataset by words.
 
-    The scene that answers is the one passed, else the file that the dataset says it came from. ``mesh.points`` must be
-    in the scene's world coordinates.
+    The scene is the one passed, else the file that the dataset records as its source. ``mesh.points`` must be in the
+    scene's world coordinates.
     """
 
     def __init__(self, mesh: pv.DataSet) -> None:
@@ -51,7 +51,7 @@ class OgDataSet:
     def segment(
         self, labels: Labels = None, scene: SceneLike | None = None, *, pose: ArrayLike | None = None, **options: Any
     ) -> Any:
-        """Label every point; returns a copy of the dataset with the arrays that this module names.
+        """Label every point; returns a copy of the dataset with the arrays listed in this module's docstring.
 
         labels, scene, pose, options, warnings: as for ``og_pointcloud.segment``.
         """
@@ -68,9 +68,9 @@ class OgDataSet:
         against: Labels = None,
         text_features: TextFeatures = None,
     ) -> pv.UnstructuredGrid:
-        """The points of the instances that a text fits, and the cells that lie wholly among them.
+        """The points of the instances that match a text, and the cells that consist of these points alone.
 
-        Point arrays: og_instance, and og_score, that of the instance.
+        Point arrays: og_instance, and og_score of the instance.
         text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected.
         """
         found = find_scene(self._mesh, scene)
@@ -89,22 +89,22 @@ class OgDataSet:
     def boxes(self, scene: SceneLike | None = None, *, up: ArrayLike | None = None) -> pv.PolyData:
         """Oriented boxes of the scene's instances that have points here, as lines: 12 cells each.
 
-        Of a segmented dataset, only labelled instances, in their label's color. Cell arrays: og_instance, og_color.
-        up: (3,) direction that boxes stand upright on, where it is known.
+        For a segmented dataset, only labelled instances, in their label's color. Cell arrays: og_instance, og_color.
+        up: (3,) vertical axis of the boxes, if known.
         """
         found = find_scene(self._mesh, scene)
         mesh = self._with_instances(found)
         if not mesh.n_points:
             return pv.PolyData()
         segmented = LABEL in mesh.point_data
-        wanted = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
-        ids = [instance for instance in np.unique(mesh.point_data[INSTANCE][wanted]).tolist() if instance >= 0]
+        included = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
+        ids = [instance for instance in np.unique(mesh.point_data[INSTANCE][included]).tolist() if instance >= 0]
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
         table = og.instance_table(found, up=up)
         return box_lines([table[instance] for instance in ids], colors)
 
     def _with_instances(self, scene: LabelledScene) -> Any:
-        """This dataset, or, where it has no instance ids, a shallow copy with the scene's."""
+        """This dataset or, if it has no instance ids, a shallow copy with the scene's."""
         if INSTANCE in self._mesh.point_data:
             return self._mesh
         mesh = self._mesh.copy(deep=False)
@@ -114,7 +114,7 @@ class OgDataSet:
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
-    """Names of the labels in og_label; OgPointcloudError where the dataset has none."""
+    """Names of the labels in og_label; OgPointcloudError if the dataset has none."""
     if LABEL not in mesh.point_data:
         raise OgPointcloudError(
             f"the {type(mesh).__name__} of {mesh.n_points:,} points has no point array '{LABEL}'; expected a segmented "
@@ -124,12 +124,12 @@ def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
 
 
 def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
-    """Oriented boxes as lines, those of instances without points left out. colors: instance id -> RGB, else by id."""
+    """Oriented boxes as lines, without those of empty instances. colors: instance id -> RGB; None: from the id."""
     boxes = {row.id: box for row in with_boxes(rows) if (box := row.oriented_box) is not None}
     if not boxes:
         return pv.PolyData()
     ids, corners = np.array([*boxes], np.int32), np.concatenate([box.corners for box in boxes.values()])
-    # VTK lists the cells one after the other, each behind its number of points: 2, first, second.
+    # VTK lists the cells one after the other, each preceded by its number of points: 2, first, second.
     edges = (np.array(BOX_EDGES) + 8 * np.arange(len(ids))[:, None, None]).reshape(-1, 2)
     lines = pv.PolyData(corners, lines=np.insert(edges, 0, 2, axis=1).ravel())
     rgb = label_colors(ids) if colors is None else np.array([colors[instance] for instance in ids.tolist()], np.uint8)
@@ -139,7 +139,7 @@ def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | No
 
 
 def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
-    """Strings as field data, by VTK itself: PyVista refuses any that are not ASCII, VTK and its files do not."""
+    """Add strings as field data through VTK: PyVista refuses non-ASCII ones, VTK and its files do not."""
     from vtkmodules.vtkCommonCore import vtkStringArray
 
     strings = vtkStringArray()
@@ -152,7 +152,7 @@ def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
 def _attach(mesh: Any, result: Segmentation) -> None:
     if len(result):  # PyVista refuses empty arrays
         for name, values in {**result.attributes, COLOR: result.colors}.items():
-            mesh.point_data.set_array(values, name, deep_copy=True)  # or edits of the mesh would change the result
+            mesh.point_data.set_array(values, name, deep_copy=True)  # else edits of the mesh would change the result
         mesh.set_active_scalars(LABEL, preference="point")
     set_strings(mesh, NAMES_FIELD, result.names)
     if result.scene is not None:
@@ -162,7 +162,7 @@ def _attach(mesh: Any, result: Segmentation) -> None:
 
 
 def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
-    """Of each instance the color of its first point here; all have the same label."""
+    """The color of each instance's first point here; all its points have the same label."""
     present, first = np.unique(np.asarray(mesh.point_data[INSTANCE]), return_index=True)
     rows = first[np.searchsorted(present, ids)]
     return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))

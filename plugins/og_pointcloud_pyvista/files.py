@@ -9,17 +9,17 @@ from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud_pyvista.datasets import INSTANCE, set_strings
 
 RGB = "RGB"
-"""Point array of the scene's own colors, as PyVista's reader of .ply names it."""
+"""Point array of the scene's own colors, named as by PyVista's .ply reader."""
 
 
 def read_ogpc(path: str) -> pv.PolyData:
-    """The points of a scene, world coordinates, float64, with og_instance, and RGB where it has colors.
+    """The points of a scene, world coordinates, float64, with og_instance, and RGB if it has colors.
 
-    The dataset remembers its file, so that ``mesh.og.segment(["chair"])`` needs no scene. BundleError for any other
-    file, also where PyVista would say that it cannot read it.
+    The dataset records its file, so that ``mesh.og.segment(["chair"])`` needs no scene. BundleError for any other file,
+    instead of PyVista's error that it cannot be read.
     """
     scene = as_scene(path)
-    # All copied: VTK writes into arrays that it is given, read-only or not, and the scene is kept for later answers.
+    # All copied: VTK writes into the arrays it is given, read-only or not, and the scene is cached.
     mesh = pv.PolyData(scene.xyz.copy()) if len(scene.xyz) else pv.PolyData()
     if len(scene.xyz):
         if scene.cloud.rgb is not None:

@@ -1,4 +1,4 @@
-"""What ``plotter.og`` does: it draws segmented datasets and boxes, and answers clicks in words."""
+"""``plotter.og``: draws segmented datasets and boxes, and answers clicks with words."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, box_lines, la
 from og_pointcloud_pyvista.files import RGB
 
 UNKNOWN_COLOR = (205, 205, 205)
-"""Lighter than in the data: most of a scene may be unknown, and what is known should stand out."""
+"""Lighter than in the data: most of a scene may be unknown, and the known part should stand out."""
 MAX_LEGEND_ENTRIES = 20
-"""At most so many names in a legend, the most frequent ones; one more entry counts the points of the others."""
+"""Maximum number of names in a legend, the most frequent ones; one more entry counts the points of the others."""
 LEGEND_MARGIN = 0.015
 HIGHLIGHT = "magenta"
 MAX_DARKENING = 0.5
-"""Share by which a label's color is darkened where the dataset's own color is black: shapes and shadows stay
+"""Share by which a label's color is darkened where the dataset's own color is black, to keep shapes and shadows
 visible."""
 PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
 TEXT_SIZE = 11
 
 
 def can_render() -> bool:
-    """Whether VTK can draw off-screen here. Tried in a process of its own: VTK crashes where it has neither EGL nor
-    OSMesa."""
-    if not os.environ.get("DISPLAY"):  # else VTK looks for an X server first, and complains
+    """Whether VTK can render off-screen here. Tried in a separate process: VTK crashes without EGL or OSMesa."""
+    if not os.environ.get("DISPLAY"):  # else VTK looks for an X server first, and prints errors
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     return subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False).returncode == 0
 
@@ -71,13 +70,13 @@ class OgPlotter:
         name: str = "og_segmentation",
         **options: Any,
     ) -> pv.Actor:
-        """Draw a segmented dataset: a color a label, or ``by="instance"``, light gray where there is none.
+        """Draw a segmented dataset with one color per label, or ``by="instance"``, light gray without one.
 
-        legend: the labels with their numbers of points. names: a label's name on each of its instances, the largest
-        first; names that would cover others are left out. point_size: pixels, for datasets of points.
-        options: of ``add_mesh``. Where the dataset has its own colors (RGB), they shade those of the labels.
+        legend: show the labels with their numbers of points. names: show a label's name on each of its instances, the
+        largest first, leaving out names that would cover others. point_size: pixels, for datasets of points.
+        options: of ``add_mesh``. If the dataset has its own colors (RGB), they shade those of the labels.
 
-        Returns the actor. Warns where no point has a label; OgPointcloudError for a dataset without points or labels.
+        Returns the actor. Warns if no point has a label; OgPointcloudError for a dataset without points or labels.
         """
         if by not in ("label", "instance"):
             raise OgPointcloudError(f"by is {by!r:.40}; expected 'label' or 'instance'")
@@ -104,11 +103,11 @@ class OgPlotter:
         return actor
 
     def add_boxes(self, of: Any, *, up: ArrayLike | None = None, **options: Any) -> pv.Actor | None:
-        """Draw oriented boxes around the labelled instances of a segmented dataset, or around all of a scene.
+        """Draw oriented boxes around the labelled instances of a segmented dataset, or around all instances of a scene.
 
-        of: a dataset with og_instance, or a scene, a LabelledCloud or the path of a .ogpc file. up: (3,) direction
-        that boxes stand upright on. options: of ``add_mesh``.
-        Returns the actor; warns, and returns None, where there is no instance to put a box around.
+        of: a dataset with og_instance, or a scene, a LabelledCloud or the path of a .ogpc file. up: (3,) vertical axis
+        of the boxes. options: of ``add_mesh``.
+        Returns the actor; without an instance to put a box around, warns and returns None.
         """
         lines = of.og.boxes(up=up) if isinstance(of, pv.DataSet) else box_lines(og.instance_table(of, up=up))
         if lines.n_cells == 0:
@@ -120,17 +119,17 @@ class OgPlotter:
         )  # fmt: skip
 
     def show_labelled(self, mesh: Any, *, up: ArrayLike = (0, 0, 1)) -> None:
-        """Look from obliquely above, from where the most labelled points of a segmented dataset are in sight.
+        """Look obliquely from above, from where the most labelled points of a segmented dataset are visible.
 
-        up: (3,) direction that is up in the picture.
+        up: (3,) direction that is up in the image.
         """
         mesh, direction = _drawable(mesh), unit_up(up)
-        label_names(mesh)  # which says so where it has no labels
+        label_names(mesh)  # raises if it has no labels
         points = np.asarray(mesh.points, np.float64)
         self.look(choose_viewpoint(points, np.asarray(mesh.point_data[LABEL]) >= 0, direction))
 
     def look(self, view: Viewpoint) -> None:
-        """Put the camera where a `Viewpoint` says."""
+        """Move the camera to a `Viewpoint`."""
         self._plotter.camera_position = [view.eye.tolist(), view.target.tolist(), view.up.tolist()]
         self._plotter.camera.view_angle = float(np.rad2deg(2 * np.arctan(1 / FOCAL)))
         self._plotter.reset_camera_clipping_range()
@@ -146,9 +145,9 @@ class OgPlotter:
     ) -> None:
         """A click shows which instance it hit: its points and box highlighted, its best words and scores in a corner.
 
-        scene: what to ask; left out, that of the dataset drawn last, else as for ``og_pointcloud.segment``.
-        labels: the words to rank; left out, the scene's own. words: how many are shown.
-        callback: called with each ``Pick``, also one that hit no instance. options: of ``enable_point_picking``.
+        scene: to query; None: that of the dataset drawn last, else as for ``og_pointcloud.segment``. labels: words to
+        rank; None: the scene's own. words: number of words shown.
+        callback: called with each ``Pick``, even if it hit no instance. options: of ``enable_point_picking``.
         """
         self._scene = find_scene(None, scene if scene is not None else self._scene)
         self._labels, self._count = labels, words
@@ -160,7 +159,7 @@ class OgPlotter:
         )  # fmt: skip
 
     def query(self, point: ArrayLike) -> Pick:
-        """Answer a click at a place, (3,) world coordinates, as ``enable_click_query`` does for the mouse."""
+        """Answer a click at a point, (3,) world coordinates, as ``enable_click_query`` does for the mouse."""
         if self._scene is None:
             raise OgPointcloudError("no scene to ask yet: call plotter.og.enable_click_query(scene) first")
         hit = og.pick(self._scene, np.asarray(point, np.float64))
@@ -211,15 +210,15 @@ class OgPlotter:
             [[entry, text] for entry, _ in entries], face="none", loc=None, font_family="arial",
             bcolor=self._plotter.background_color, background_opacity=0.8,
         )  # fmt: skip
-        # In the upper right corner, by hand: PyVista's `loc` puts wide legends too far inside.
+        # Placed in the upper right corner manually: PyVista's `loc` puts wide legends too far inside.
         legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)
         legend.SetPosition2(*size)
-        # Words in the text's color beside a swatch: VTK by itself gives both the color of the swatch.
+        # Words in the text's color beside a swatch: by default VTK gives both the color of the swatch.
         for index, (_, color) in enumerate(entries if colored else []):
             legend.SetEntryIcon(index, _swatch(color))
 
     def _add_names(self, mesh: Any, labels: NDArray[np.integer], words: Sequence[str], name: str) -> None:
-        """Each labelled instance's word, the largest instances first."""
+        """Draw each labelled instance's word, the largest instances first."""
         ids = np.asarray(mesh.point_data[INSTANCE])
         labelled = (labels >= 0) & (ids >= 0)
         # Labelled points sorted by instance, cut where the next one begins.
@@ -243,8 +242,8 @@ def _colors(ids: NDArray[np.integer]) -> NDArray[np.uint8]:
 
 
 def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
-    """Colors (n, 3) darkened where the dataset's own colors are dark, relative to its brightest ones; as they are
-    without such."""
+    """Colors (n, 3) darkened where the dataset's own colors are dark, relative to its brightest ones; unchanged if it
+    has none."""
     rgb = mesh.point_data.get(RGB)
     if rgb is None:
         return colors
@@ -255,8 +254,8 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
 
 
 def _drawable(mesh: Any) -> Any:
-    """The dataset without points that are not finite, which would make VTK draw nothing at all. OgPointcloudError where
-    none are left."""
+    """The dataset without non-finite points, which would make VTK draw nothing at all. OgPointcloudError if none are
+    left."""
     finite = np.logical_and.reduce(np.isfinite(np.asarray(mesh.points)), axis=1)
     if not finite.any():
         raise OgPointcloudError(
@@ -272,7 +271,7 @@ def _drawable(mesh: Any) -> Any:
 
 
 def _is_cloud(mesh: Any) -> bool:
-    """Whether a dataset has only vertices as cells, or none."""
+    """Whether all cells of a dataset are vertices, or it has none."""
     if isinstance(mesh, pv.PolyData):
         return mesh.n_verts == mesh.n_cells
     kinds = getattr(mesh, "celltypes", None)
@@ -281,7 +280,7 @@ def _is_cloud(mesh: Any) -> bool:
 
 
 def _middle_point(points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The point nearest to the median of all. It lies on the object; the mean of a ring's points would not."""
+    """The point nearest to the median of all. It lies on the object, unlike the mean of a ring's points."""
     return points[((points - np.median(points, axis=0)) ** 2).sum(axis=1).argmin()]
 
 

@@ -1,6 +1,6 @@
 """A ROS 2 bag in, the same bag with labels out, without ROS: rosbags reads and writes files and messages.
 
-The new bag holds all messages of the old one, byte for byte, and beside each cloud its labels and its detections.
+The new bag holds all messages of the old one, byte for byte, and with each cloud its labels and detections.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
 LABELLED = "/labelled"
 OUTPUTS = {LABELLED: CLOUD, "/detections": DETECTION_ARRAY}
-"""Ending of an output's topic, behind that of its cloud -> its type; in the order of `LabelledMessages`."""
+"""Suffix appended to a cloud's topic for each output -> its type; in the order of `LabelledMessages`."""
 LABEL_INFO = "/og_pointcloud/label_info"
 BAG_VERSION = 8
 """Version of rosbag2's metadata, which Humble and all later releases read."""
@@ -46,7 +46,7 @@ LATCHED_QOS = Qos(
     INFINITE_DURATION, QosLiveliness.AUTOMATIC, INFINITE_DURATION, False,
 )  # fmt: skip
 UNKNOWN_TYPE_HASH = "RIHS01_" + "0" * 64
-"""Hash of a type that neither the bag defines nor rosbags knows: bags of Humble and older only name types."""
+"""Hash of a type that neither the bag defines nor rosbags knows: bags of Humble and older store only type names."""
 
 VISION_MSGS: Mapping[str, str] = {
     "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name",
@@ -62,12 +62,12 @@ VISION_MSGS: Mapping[str, str] = {
     ),
     "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
-"""The fields of vision_msgs 4, that of ROS 2 Humble and later."""
+"""Message definitions of vision_msgs 4, the version of ROS 2 Humble and later."""
 
 
 @dataclass
 class BagReport:
-    """What ``label_bag`` did. topics: a cloud's topic -> the topic of its labels. seconds: wall clock spent on clouds.
+    """Result of ``label_bag``. topics: a cloud's topic -> the topic of its labels. seconds: wall time spent on clouds.
 
     skipped: number of clouds that could not be labelled, by reason. counts: number of points of each name.
     """
@@ -100,14 +100,14 @@ def label_bag(
     minimum_points: int = MINIMUM_POINTS,
     progress: bool = False,
 ) -> BagReport:
-    """Copy a ROS 2 bag and label its clouds, each at its place in the scene by /tf and /tf_static.
+    """Copy a ROS 2 bag and label its clouds, placed in the scene by /tf and /tf_static.
 
-    source: a bag's folder, .db3 or .mcap, its messages with zstd or without. target: the folder to make, of the same
-    storage; it appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
-    progress: show a bar with the remaining time, where stderr is a terminal.
-    Of a cloud on ``T`` the labels are on ``T/labelled``, in the cloud's own frame, the boxes on ``T/detections`` in the
-    scene's; the names are on /og_pointcloud/label_info, latched. A cloud without a transform, or damaged, is skipped.
-    SceneError for what is no such bag or has no such topic, or where no cloud can be labelled.
+    source: a bag's folder, .db3 or .mcap, its messages with zstd or without. target: the folder to create, with the
+    same storage; it appears once it is complete. topics: PointCloud2 topics to label, None for all. frame: the scene's
+    frame. progress: show a bar with the remaining time if stderr is a terminal.
+    The labels of a cloud on ``T`` are on ``T/labelled``, in the cloud's own frame, the boxes on ``T/detections``, in
+    the scene's; the names are on /og_pointcloud/label_info, latched. A cloud without a transform, or damaged, is
+    skipped. SceneError if it is no such bag or has no such topic, or if no cloud can be labelled.
     """
     source, target = Path(source), Path(target)
     if target.exists():
@@ -115,7 +115,7 @@ def label_bag(
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
-        tree = transforms_of(reader, store)  # all of them first: the transform after a cloud is needed, too
+        tree = transforms_of(reader, store)  # read all first: the transform after a cloud is needed too
         messages = rosbags_messages(store)
         labeller = CloudLabeller(segmenter, messages, frame, minimum_points)
         with (
@@ -153,7 +153,7 @@ def _label(
         message = decoded(store, data, CLOUD)
         pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
         labelled = labeller(message, pose)
-    except Exception as error:  # one bad cloud, whatever is in it, does not cost the others
+    except Exception as error:  # one bad cloud, whatever is in it, does not affect the others
         kind = "" if isinstance(error, OgPointcloudError) else f"{type(error).__name__}: "
         report.skipped[kind + first_line(error)] += 1
         return None
@@ -165,7 +165,7 @@ def _label(
 
 @contextmanager
 def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
-    """rosbags' reader of a ROS 2 bag; SceneError says what is wrong with any other."""
+    """rosbags' reader of a ROS 2 bag; SceneError, with the cause, for anything else."""
     path = Path(source)
     if path.is_file() and path.suffix == ".bag":
         raise SceneError(
@@ -193,7 +193,7 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
 def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
     """The new bag's connection for a topic of the old one, with its type definition and QoS."""
     ext: Any = old.ext
-    # As the old bag defines it; a type that it only names is defined by rosbags, if that knows it.
+    # Defined as in the old bag; a type that it only names is defined by rosbags, if it knows it.
     definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or UNKNOWN_TYPE_HASH}
     if not (old.msgdef.data and old.digest) and old.msgtype in store.types:
         definition = {"typestore": store}
@@ -204,7 +204,7 @@ def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
 
 
 def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
-    """The topics to label. SceneError for one that is absent or no cloud, and for a bag that has been labelled."""
+    """The topics to label. SceneError for one that is missing or no cloud, and for a bag that is already labelled."""
     types = {connection.topic: connection.msgtype for connection in reader.connections}
     all_clouds = sorted(topic for topic, kind in types.items() if kind == CLOUD and not topic.endswith(LABELLED))
     wanted = list(dict.fromkeys(topics)) if topics else all_clouds
@@ -222,7 +222,7 @@ def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
 
 
 def transforms_of(reader: Reader, store: Any) -> TransformTree:
-    """All of /tf and /tf_static; messages that make no sense are left out, with a warning."""
+    """All transforms of /tf and /tf_static; invalid messages are left out, with a warning."""
     tree, damaged = TransformTree(), Counter[str]()
     connections = [old for old in reader.connections if old.msgtype == TRANSFORMS]
     for connection, _, data in messages_of(reader, connections) if connections else ():
@@ -237,7 +237,7 @@ def transforms_of(reader: Reader, store: Any) -> TransformTree:
 
 
 def messages_of(reader: Reader, connections: Sequence[Connection] = ()) -> Iterator[tuple[Connection, int, bytes]]:
-    """Connection, stamp in nanoseconds and bytes of each message; of all connections where none are named."""
+    """Connection, stamp in nanoseconds and bytes of each message; of all connections if none are given."""
     try:
         yield from reader.messages(connections)
     except Exception as error:  # of rosbags or of its databases
@@ -245,7 +245,7 @@ def messages_of(reader: Reader, connections: Sequence[Connection] = ()) -> Itera
 
 
 def decoded(store: Any, data: bytes, kind: str) -> Any:
-    """A message of this type; SceneError for bytes that are none."""
+    """A message of this type; SceneError for invalid bytes."""
     try:
         return store.deserialize_cdr(data, kind)
     except Exception as error:  # a damaged message may end anywhere
@@ -253,13 +253,13 @@ def decoded(store: Any, data: bytes, kind: str) -> Any:
 
 
 def _storage(source: Path) -> StoragePlugin:
-    """The storage of the source, which is a file of it or a folder of such files."""
+    """The storage type of the source, a file or a folder of files."""
     files = [source] if source.is_file() else list(source.iterdir())
     return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
 
 
 def ros2_types() -> Typestore:
-    """Types of ROS 2 Humble, whose clouds and transforms are those of every later release, and vision_msgs."""
+    """Types of ROS 2 Humble, with the clouds and transforms of every later release, and vision_msgs."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, fields in VISION_MSGS.items():
         store.register(get_types_from_msg(fields, name))

@@ -29,12 +29,12 @@ def to_detections(
     minimum_points: int = 1,
     messages: MessageFactory = plain_messages,
 ) -> Any:
-    """The labelled instances that points of ``result`` lie on, as vision_msgs/Detection3DArray.
+    """The labelled instances with points in ``result``, as vision_msgs/Detection3DArray.
 
     Each has its label's name as class id, its score, its instance id as id, and the oriented box of the whole instance
-    as the scene knows it; the result may show only a part of that.
-    instances: a scene, or ``og.instance_table(scene, up=(0, 0, 1))`` of it for boxes that stand upright; keep the
-    table, as it computes each box once. result: what ``segment`` or a ``Segmenter`` said of a cloud of the same scene.
+    in the scene; the result may show only a part of that.
+    instances: a scene, or ``og.instance_table(scene, up=(0, 0, 1))`` of it for upright boxes; keep the table, as it
+    computes each box once. result: of ``segment`` or a ``Segmenter`` for a cloud of the same scene.
     frame_id: the scene's frame. stamp: a Time message, or nanoseconds since the epoch.
     minimum_points: an instance with fewer points in the result is left out.
     """
@@ -45,7 +45,7 @@ def to_detections(
         raise OgPointcloudError(
             f"the result has instance {owners.max()}, the table {len(table)}: they are of two scenes"
         )
-    # A row of the result for each instance. Any will do: all points of an instance have one label and score.
+    # One row of the result for each instance, no matter which: all its points have the same label and score.
     example = np.zeros(len(table), np.int64)
     example[owners] = labelled
     seen = np.flatnonzero(np.bincount(owners, minlength=len(table)) >= max(minimum_points, 1))
@@ -61,7 +61,7 @@ def to_detections(
 def to_label_info(
     names: Sequence[str], frame_id: str = "", stamp: Any = None, *, messages: MessageFactory = plain_messages
 ) -> Any:
-    """What the numbers in the field ``label`` mean, as vision_msgs/LabelInfo, to be published once, latched.
+    """The meaning of the numbers in the field ``label``, as vision_msgs/LabelInfo, to be published once, latched.
 
     names: those of the result, at most 65,535.
     """
@@ -77,8 +77,8 @@ def to_label_info(
 def to_objects(
     objects: Sequence[MapObject], frame_id: str = "map", stamp: Any = None, *, messages: MessageFactory = plain_messages
 ) -> Any:
-    """The objects of a map (`Mapper.objects`) as vision_msgs/Detection3DArray: the object's id, its box along the axes
-    of the map's frame, and its state as class id: present, moved, unseen, or gone, then with its last box."""
+    """The objects of a map (`Mapper.objects`) as vision_msgs/Detection3DArray: id, box aligned with the map's frame,
+    and state as class id: present, moved, unseen, or gone, then with its last box."""
     head = header(messages, frame_id, stamp)
     detections = [_detection(entry.id, entry.box, entry.state, 1.0, head, messages) for entry in objects]
     return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)

@@ -1,8 +1,8 @@
 """Messages of one stamp -> a frame of a map: depth and color images, masks with features, the camera.
 
 Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 16UC1 or 32SC1: 0 none, else a number from 1 on
-that means something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask, the encoder's
-features of masks 1, 2, ... CameraInfo counts pixel centers at whole numbers.
+that is valid in this image only. A PointCloud2 with a field ``feature`` has one row per mask, the encoder's features of
+masks 1, 2, ... CameraInfo has pixel centers at integer coordinates.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8"
 
 
 def image_array(message: Any) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) pixels of a sensor_msgs/Image, colors as RGB. SceneError for an encoding that is unknown."""
+    """(H, W) or (H, W, 3) pixels of a sensor_msgs/Image, colors as RGB. SceneError for an unknown encoding."""
     encoding = str(message.encoding)
     if encoding not in ENCODINGS:
         raise SceneError(f"image encoding is '{encoding}'; expected one of {', '.join(ENCODINGS)}")
     kind = np.dtype(ENCODINGS[encoding]).newbyteorder(">" if message.is_bigendian else "<")
     data = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8)
     channels = 3 if encoding in ("rgb8", "bgr8") else 1
-    # A line may be longer than its pixels: step counts the padding, too.
+    # A line may be longer than its pixels: step includes padding.
     line = message.width * channels * kind.itemsize
     if message.step < line or len(data) < message.step * message.height:
         raise SceneError(f"image has {len(data)} bytes, {message.step} a line; expected {message.height} of {line}")
@@ -48,7 +48,7 @@ def image_array(message: Any) -> NDArray[Any]:
 
 @dataclass
 class _Parts:
-    """The messages of one stamp that have come so far. frame_id: of the camera."""
+    """The messages of one stamp received so far. frame_id: of the camera."""
 
     frame_id: str = ""
     depth: NDArray[Any] | None = None
@@ -58,9 +58,9 @@ class _Parts:
 
 
 class FrameAssembler:
-    """Puts messages together by their stamps. whole: roles that a frame waits for. rectified: whether images are, as
-    image_proc makes them: the camera_info beside them still tells the lens of the raw ones. waiting: by stamp, in
-    nanoseconds, in the order in which they came."""
+    """Groups messages into frames by stamp. required: roles that a frame waits for. rectified: whether images are
+    rectified, as by image_proc: their camera_info still describes the lens of the raw ones. waiting: by stamp, in
+    nanoseconds, in order of arrival."""
 
     def __init__(self, required: Iterable[str] = REQUIRED_ROLES, *, rectified: bool = False) -> None:
         self.required, self.rectified, self.waiting = tuple(required), rectified, dict[int, _Parts]()
@@ -68,7 +68,7 @@ class FrameAssembler:
         self._warned = False  # of colors that are left out
 
     def add(self, role: str, message: Any) -> None:
-        """Take a message of a role: "info" or a field of `_Parts`. SceneError for what it is not."""
+        """Add a message of a role: "info" or a field of `_Parts`. SceneError if it does not fit the role."""
         stamp = nanoseconds(message.header.stamp)
         if role == "info":  # the lens does not change from frame to frame: the latest one serves all
             self._info = message
@@ -91,15 +91,15 @@ class FrameAssembler:
             setattr(parts, role, pixels)
 
     def is_complete(self, stamp: int) -> bool:
-        """Whether all that a frame waits for has come, the camera among it."""
+        """Whether everything that a frame waits for has arrived, including the camera."""
         parts = self.waiting[stamp]
         return self._info is not None and all(getattr(parts, role) is not None for role in self.required)
 
     def frame(self, stamp: int, pose: Callable[[str, int], NDArray[np.float64]]) -> Frame | None:
-        """The frame of a stamp, from what has come of it; None where that is neither depth nor masks with features.
-        Call `forget` when it is used.
+        """The frame of a stamp, from what has arrived; None without depth or masks with features. Call `forget` after
+        use.
 
-        pose: (frame id, stamp) -> (4, 4) from there to the map; its errors are passed on. SceneError without a camera.
+        pose: (frame id, stamp) -> (4, 4) from that frame to the map; its errors propagate. SceneError without a camera.
         """
         parts = self.waiting[stamp]
         has_masks = parts.masks is not None and parts.features is not None
@@ -115,7 +115,7 @@ class FrameAssembler:
         return Frame(camera, masks, features, depth, rgb=self._rgb(parts.color, camera), stamp=stamp / NANOSECONDS)
 
     def _rgb(self, color: NDArray[Any] | None, camera: Camera) -> NDArray[np.uint8] | None:
-        """Colors that fit the camera's image; None where they do not, which is said once: they are no frame's need."""
+        """Colors that fit the camera's image; else None, with a single warning, as frames do not need them."""
         if color is None or (color.dtype == np.uint8 and color.shape[:2] == (camera.height, camera.width)):
             return color
         if not self._warned:
@@ -128,7 +128,7 @@ class FrameAssembler:
         return None
 
     def forget(self, stamp: int) -> None:
-        """Let go of a stamp."""
+        """Drop a stamp."""
         self.waiting.pop(stamp, None)
 
 

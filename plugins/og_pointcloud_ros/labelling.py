@@ -1,4 +1,4 @@
-"""What a bag and a running node do with each cloud: message in, labelled cloud and detections out."""
+"""Labels each cloud of a bag or a running node: message in, labelled cloud and detections out."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from og_pointcloud_ros.messages import MessageFactory
 from og_pointcloud_ros.pointcloud2 import from_pointcloud2, read_fields, to_pointcloud2
 
 UP = (0.0, 0.0, 1.0)
-"""Axis that boxes stand upright on: z is up in ROS frames (REP 103)."""
+"""Vertical axis of boxes: z is up in ROS frames (REP 103)."""
 MINIMUM_POINTS = 10
-"""An instance with fewer points in a cloud is a speck and no detection."""
+"""An instance with fewer points in a cloud is no detection."""
 
 
 class LabelledMessages(NamedTuple):
@@ -30,8 +30,8 @@ class LabelledMessages(NamedTuple):
 class CloudLabeller:
     """Labels PointCloud2 messages one by one; words are scored, and boxes computed, once.
 
-    segmenter: of the scene, may be replaced by one of other labels.
-    frame: the scene's frame, which detections are given in. minimum_points: that an instance needs to be a detection.
+    segmenter: of the scene; may be replaced by one with other labels.
+    frame: the scene's frame, that of detections. minimum_points: points that an instance needs to be a detection.
     """
 
     def __init__(
@@ -42,15 +42,15 @@ class CloudLabeller:
         self._instances = instance_table(segmenter.scene, up=UP)  # keeps the boxes
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
-        """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
+        """message: a cloud in the sensor's frame. pose: (4, 4), from there to the scene's frame.
 
         The labelled cloud keeps the frame, stamp and coordinates of the message, so that tools that match the two by
-        time, or show them by tf, find them in one place.
+        time, or display them with tf, see them in the same place.
         """
         xyz = from_pointcloud2(message)
         result = self.segmenter(xyz, pose)
         head = message.header
-        # Coordinates are written in float64 where they came so: those of a map may lie far from 0.
+        # Coordinates stay float64 if they were: those of a map may lie far from 0.
         kind = read_fields(message).dtype
         double = any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
         points = to_pointcloud2(result, head.frame_id, head.stamp, xyz=xyz, double=double, messages=self._messages)

@@ -1,8 +1,8 @@
 """Frames of a map from a ROS 2 bag, without ROS: depth and color images, masks with features, poses from tf.
 
-Topics are known by type and name: an Image with "depth" in its topic's name is depth, one with "mask" is masks, any
-other is color; a PointCloud2 with "feature" brings features (`frames`). Images are rectified where depth or masks have
-"rect" in their topic's name. Messages of one stamp are one frame.
+Topics are recognized by type and name: an Image with "depth" in its topic's name is depth, one with "mask" is masks,
+any other is color; a PointCloud2 with "feature" brings features (`frames`). Images are rectified where depth or masks
+have "rect" in their topic's name. Messages of one stamp are one frame.
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ from og_pointcloud_ros.transforms import TransformTree
 
 IMAGE, INFO, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 MAX_PENDING_STAMPS = 100
-"""Stamps that wait for their other messages; masks come seconds after their image."""
+"""Number of stamps that wait for their other messages; masks come seconds after their image."""
 
 
 class BagFrames:
-    """Iterates over the frames of a bag. frame: what tf calls the map. dropped: reason -> number of frames that could
-    not be used.
+    """Iterates over the frames of a bag. frame: the map's frame in tf. dropped: reason -> number of unusable frames.
 
-    SceneError where the bag has no depth, no masks, or no camera_info.
+    SceneError if the bag has no depth, no masks, or no camera_info.
     """
 
     def __init__(self, source: str | os.PathLike[str], frame: str = "map") -> None:
@@ -46,7 +45,7 @@ class BagFrames:
                     assembler.add(role, decoded(store, data, connection.msgtype))
                 except (OgPointcloudError, ValueError) as error:
                     self._drop(f"{role}: {error}")
-                # Frames that are whole; else the oldest of too many that wait, with what has come of them.
+                # Complete frames; else the oldest of too many waiting ones, with the messages that have arrived.
                 ready = [*filter(assembler.is_complete, assembler.waiting)]
                 for stamp in ready or sorted(assembler.waiting)[:-MAX_PENDING_STAMPS]:
                     yield from self._made(stamp, assembler, tree)
@@ -54,7 +53,7 @@ class BagFrames:
                 yield from self._made(stamp, assembler, tree)
 
     def _made(self, stamp: int, assembler: FrameAssembler, tree: TransformTree) -> Iterator[Frame]:
-        """The frame of a stamp, or none where it shows nothing or is dropped; the stamp is let go in any case."""
+        """The frame of a stamp, or none if it shows nothing or is dropped; the stamp is forgotten in any case."""
         try:
             if (frame := assembler.frame(stamp, partial(tree.lookup, self.frame))) is not None:
                 yield frame
@@ -67,7 +66,7 @@ class BagFrames:
 
 
 def _roles(topics: list[tuple[str, str]], source: str) -> dict[str, str]:
-    """Topic -> what it brings; the first of each kind in alphabetical order."""
+    """Topic -> role; the first topic of each role in alphabetical order."""
     roles: dict[str, str] = {}
     for topic, kind in sorted(set(topics)):
         name, role = topic.lower(), None

@@ -6,9 +6,9 @@ Publishes ~/objects (vision_msgs/Detection3DArray, latched) after each frame: id
 present, moved, unseen or gone. Serves ~/save, ~/load and ~/reset (std_srvs/Trigger): the map to and from the file that
 the parameter ``map`` names, and an empty one.
 
-Frames go through a queue into a thread of its own, so that no sensor waits. Those that get too old there are dropped,
-and so are those whose transform does not come; those that wait too long for their masks are used without. Every drop is
-logged. No message ends the node.
+Frames go through a queue into a separate thread, so that no sensor waits. Those that get too old there are dropped, and
+so are those without a transform; those that wait too long for their masks are used without them. Every drop is logged.
+No message ends the node.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from og_pointcloud_ros.messages import ros_messages, time_message
 from og_pointcloud_ros.node import PlacedNode, error_text, latest_only, run
 
 PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "rectified": False, "max_age": 2.0}
-"""With their defaults; config/map.yaml explains them."""
+"""Parameters with their defaults; config/map.yaml explains them."""
 INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
 QUEUE_DEPTH = 10
-"""Messages of a topic that may wait while a service answers."""
+"""Messages per topic that may wait while a service call runs."""
 
 
 class MapNode(PlacedNode):
@@ -61,12 +61,12 @@ class MapNode(PlacedNode):
     def _on_message(self, role: str, message: Any) -> None:
         try:
             self._assembler.add(role, message)
-        except Exception as error:  # whatever a message holds, the node goes on
+        except Exception as error:  # whatever a message holds, the node keeps running
             self._warn(f"{role} was dropped: {error_text(error)}")
         self._work()
 
     def _work(self) -> None:
-        """Hand on the frames that are whole, or have waited long enough for the rest."""
+        """Pass on the frames that are complete, or have waited long enough for the rest."""
         now = time.monotonic()  # waiting counts from arrival: stamps may be of a bag or a simulation
         self._arrived = {stamp: self._arrived.get(stamp, now) for stamp in self._assembler.waiting}
         for stamp, arrived in self._arrived.items():
@@ -77,7 +77,7 @@ class MapNode(PlacedNode):
                 if (frame := self._assembler.frame(stamp, self._pose)) is not None:
                     self._queue.put(frame)
             except TransformException as error:
-                if not is_old:  # tf is often a little later: it is asked again
+                if not is_old:  # tf is often a little later: retried
                     continue
                 self._warn(f"a frame was dropped, its transform did not come within {self._max_age} s: {error}")
             except Exception as error:
@@ -101,7 +101,7 @@ class MapNode(PlacedNode):
         )
 
     def _serve(self, serve: Callable[[], str], _: Any, response: Any) -> Any:
-        """Answer a Trigger: while no frame goes in."""
+        """Answer a Trigger while no frame is being integrated."""
         try:
             with self._queue.lock:
                 response.success, response.message = True, serve()

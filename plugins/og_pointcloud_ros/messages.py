@@ -1,7 +1,7 @@
-"""ROS messages without ROS: ways to make one.
+"""Making ROS messages without ROS.
 
-Whatever makes messages here takes a ``MessageFactory``, so that the same lines fill plain objects, rosbags' types
-(``bags.rosbags_messages``) and rclpy's. Reading needs no factory: a message is whatever has its attributes.
+All code that makes messages takes a ``MessageFactory``, so that the same lines fill plain objects, rosbags' types
+(``bags.rosbags_messages``) and rclpy's. Reading needs no factory: a message is any object with its attributes.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ sequence or array of numbers.
 
 
 def plain_messages(type_name: str, /, **fields: Any) -> Any:
-    """Plain objects with the message's fields, of a class with its name; they need neither ROS nor rosbags."""
+    """Plain objects with the message's fields, of a class with its name, without ROS or rosbags."""
     return type(type_name.rpartition("/")[2], (SimpleNamespace,), {})(**fields)
 
 
 def ros_messages(type_name: str, /, **fields: Any) -> Any:
-    """The message types of a ROS 2 installation, which are imported here and only here."""
+    """Messages of a ROS 2 installation, imported only here."""
     package, _, name = type_name.partition("/msg/")
     kind = getattr(importlib.import_module(f"{package}.msg"), name)
-    # rclpy takes an array.array of bytes as it is; anything else it checks byte by byte.
+    # rclpy takes an array.array of bytes as it is, but checks anything else byte by byte.
     for key, value in fields.items():
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
             fields[key] = array.array("B", value.tobytes())
@@ -49,13 +49,13 @@ def header(messages: MessageFactory, frame_id: str, stamp: Any) -> Any:
 
 
 def time_message(messages: MessageFactory, stamp: Any) -> Any:
-    """A builtin_interfaces/Time of what `header` takes."""
+    """A builtin_interfaces/Time. stamp: as for `header`."""
     sec, nanosec = divmod(nanoseconds(stamp), NANOSECONDS)
     return messages("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
 def nanoseconds(stamp: Any) -> int:
-    """Nanoseconds since the epoch of a Time message, of a number of them, or of None, which is 0."""
+    """Nanoseconds since the epoch, from a Time message, an integer number of nanoseconds, or None, which is 0."""
     if stamp is None:
         return 0
     if hasattr(stamp, "sec") and hasattr(stamp, "nanosec"):

@@ -1,10 +1,10 @@
-"""The ROS 2 node: clouds in, labelled clouds and detections out. It and `map_node` alone need ROS.
+"""The ROS 2 node: clouds in, labelled clouds and detections out. Only this and `map_node` need ROS.
 
-Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alone).
+Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, only the newest).
 Publishes ~/output/points, ~/output/detections and, latched, ~/label_info. A cloud is placed in the scene by tf.
 
-Work is left out rather than queued: a cloud is dropped when nobody listens, when a newer one has come, or when its
-transform does not come in time. No message ends the node: what it cannot use is logged.
+Clouds are dropped rather than queued: when nobody subscribes, when a newer one has arrived, or when the transform does
+not arrive in time. No message ends the node: what it cannot use is logged.
 """
 
 from __future__ import annotations
@@ -42,17 +42,18 @@ PARAMETERS = {
     "max_age": 0.5,
     "minimum_points": MINIMUM_POINTS,
 }
-"""With their defaults; config/parameters.yaml explains them. An empty list has no type in ROS, hence [""]."""
+"""Parameters with their defaults; config/parameters.yaml explains them. An empty list has no type in ROS, hence
+[""]."""
 RETRY_S = 0.02
-"""Seconds between two tries to find a waiting cloud's transform: tf is often a little later than the cloud."""
+"""Seconds between two attempts to find a waiting cloud's transform: tf is often a little later than the cloud."""
 WARNING_INTERVAL_S = 5.0
-"""Seconds between two warnings at least."""
+"""Minimum seconds between two warnings."""
 
 
 class PlacedNode(Node):
-    """What both nodes share: parameters, poses of messages from tf, and a timer for messages that wait for their pose.
+    """Base of both nodes: parameters, poses of messages from tf, and a timer for messages that wait for their pose.
 
-    parameters: with their defaults, ``target_frame`` and ``max_age`` among them.
+    parameters: with their defaults, including ``target_frame`` and ``max_age``.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any], **options: Any) -> None:
@@ -68,23 +69,23 @@ class PlacedNode(Node):
         return self.get_parameter(name).value
 
     def _work(self) -> None:
-        """Try again what waits; called every RETRY_S seconds."""
+        """Retry what is waiting; called every RETRY_S seconds."""
         raise NotImplementedError
 
     def _pose_at(self, head: Any) -> NDArray[np.float64]:
-        """(4, 4) from a header's frame to the target's at its time; tf2's TransformException without one."""
+        """(4, 4) from a header's frame to the target frame at its time; tf2's TransformException if unknown."""
         found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
-        place, turn = found.transform.translation, found.transform.rotation
-        return pose_of((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+        translation, rotation = found.transform.translation, found.transform.rotation
+        return pose_of((translation.x, translation.y, translation.z), (rotation.x, rotation.y, rotation.z, rotation.w))
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=WARNING_INTERVAL_S)
 
 
 class SegmentNode(PlacedNode):
-    """See the module. The parameter ``labels`` may be set while it runs; the others are read at the start.
+    """See the module. The parameter ``labels`` may be set at run time; the others are read at the start.
 
-    SceneError, BundleError or FeatureSpaceError where the scene or the words cannot be used.
+    SceneError, BundleError or FeatureSpaceError if the scene or the words cannot be used.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -123,14 +124,14 @@ class SegmentNode(PlacedNode):
         self.get_logger().info(f"{len(names)} labels: {', '.join(names)}")
 
     def _on_parameters(self, parameters: Sequence[Any]) -> Any:
-        """Take over new labels; refuse, with the reason, what cannot be used, before it is set."""
+        """Adopt new labels; refuse unusable values, with the reason, before they are set."""
         for parameter in parameters:
             if parameter.name in PARAMETERS and parameter.name != "labels":
                 return SetParametersResult(successful=False, reason=f"{parameter.name} is read at the start only")
         for labels in (parameter.value for parameter in parameters if parameter.name == "labels"):
             try:
                 self._labeller.segmenter = self._segmenter(labels or [])
-            except Exception as error:  # words come from outside, and a robot goes on with those that it had
+            except Exception as error:  # words are user input, and a robot keeps those that it had
                 return SetParametersResult(successful=False, reason=error_text(error))
             self._announce()
         return SetParametersResult(successful=True)
@@ -139,14 +140,14 @@ class SegmentNode(PlacedNode):
         if not (self._points.get_subscription_count() or self._detections.get_subscription_count()):
             self._waiting = None
             return
-        self._waiting = (message, time.monotonic())  # in place of an older one that still waits
+        self._waiting = (message, time.monotonic())  # replaces an older one that still waits
         self._work()
 
     def _work(self) -> None:
-        """Label the waiting cloud, if there is one and its transform has come."""
+        """Label the waiting cloud, if there is one and its transform has arrived."""
         if self._waiting is None:
             return
-        # Taken first, and put back only while its transform may still come: a cloud that fails is not tried again.
+        # Removed first, and put back only while its transform may still arrive: a cloud that fails is not retried.
         message, arrived = self._waiting
         self._waiting = None
         try:
@@ -156,7 +157,7 @@ class SegmentNode(PlacedNode):
                 self._waiting = message, arrived
             else:
                 self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
-        except Exception as error:  # whatever a message holds, the node goes on
+        except Exception as error:  # whatever a message holds, the node keeps running
             self._warn(f"a cloud was dropped: {error_text(error)}")
         else:
             self._points.publish(labelled.points)
@@ -164,19 +165,19 @@ class SegmentNode(PlacedNode):
 
 
 def error_text(error: Exception) -> str:
-    """Its message; of an error that is not of this library, which says little by itself, the type as well."""
+    """The error's message, with its type for errors of other libraries, which say little by themselves."""
     return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
 
 def latest_only(reliability: Any, latched: bool = False, depth: int = 1) -> Any:
     """QoS that keeps only the newest message, or the newest ``depth``. A reliable publisher serves reliable and best
-    effort subscribers; a best effort subscriber hears publishers of both kinds."""
+    effort subscribers; a best effort subscriber receives from both."""
     durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
 
 
 def run(make: Callable[[], Node], arguments: Sequence[str] | None) -> int:
-    """Make a node and run it until it is stopped. Returns the exit code, 2 for what it cannot use."""
+    """Make a node and run it until it is stopped. Returns the exit code, 2 for unusable input."""
     rclpy.init(args=arguments)
     try:
         node = make()

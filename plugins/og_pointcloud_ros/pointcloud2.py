@@ -1,7 +1,7 @@
 """sensor_msgs/PointCloud2 <-> arrays, in numpy alone.
 
-A message is whatever has a PointCloud2's attributes: one of rclpy, of rosbags (ROS 1 or 2), or a plain object. Its
-stated sizes are used only after they are found to agree with each other and with the data.
+A message is any object with a PointCloud2's attributes: of rclpy, of rosbags (ROS 1 or 2), or a plain one. Its sizes
+are used only after checking that they agree with each other and with the data.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
 MAX_FLOAT32_M = 2.0**14
-"""Meters from 0, 16 km, within which float32 counts millimeters."""
+"""Meters from 0 (16 km) within which float32 resolves millimeters."""
 UNLABELLED = 65535
-"""Label of a point without one: what vision_msgs/LabelInfo keeps for that among 16-bit ids."""
+"""Label of an unlabelled point: the 16-bit id that vision_msgs/LabelInfo reserves for that."""
 ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "data")
 TYPE_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's datatypes."""
@@ -29,10 +29,10 @@ DATATYPES = {np.dtype(code): number for number, code in TYPE_CODES.items()}
 
 
 def from_pointcloud2(message: Any) -> NDArray[np.float64]:
-    """(N, 3) float64, the x y z of every point, row by row for an organized cloud, in the message's own frame.
+    """(N, 3) float64, x y z of every point, row by row for an organized cloud, in the message's own frame.
 
-    N is height * width: invalid points stay, as NaN or infinity, so that row i is point i of the message. x, y and z
-    may be of any of the eight types, in any order, at any offset. SceneError where they are absent, or sizes disagree.
+    N is height * width: invalid points stay as NaN or infinity, so that row i is point i of the message. x, y and z may
+    have any of the eight types, in any order, at any offset. SceneError if they are missing, or sizes disagree.
     """
     rows = read_fields(message)
     xyz = np.empty((*rows.shape, 3))
@@ -49,8 +49,8 @@ def from_pointcloud2(message: Any) -> NDArray[np.float64]:
 def read_fields(message: Any) -> NDArray[Any]:
     """(height, width) structured array over the message's own bytes: ``read_fields(message)["intensity"]``.
 
-    Nothing is copied, unless data is a plain list; read-only where the message's bytes are. A field of count c has
-    shape (height, width, c). Numbers are in the message's byte order. SceneError where sizes disagree.
+    Nothing is copied, unless data is a plain list; read-only if the message's bytes are. A field of count c has shape
+    (height, width, c). Numbers are in the message's byte order. SceneError if sizes disagree.
     """
     if absent := [name for name in ATTRIBUTES if not hasattr(message, name)]:
         raise SceneError(f"a {type(message).__name__} has no '{absent[0]}'; expected a sensor_msgs/PointCloud2")
@@ -66,7 +66,7 @@ def read_fields(message: Any) -> NDArray[Any]:
             f"the fields of a PointCloud2 are damaged ({error}); expected each with name, offset, datatype and count"
         ) from None
     data = _bytes_of(message.data)
-    # A single row needs no step, and the last row no padding: some drivers leave them out.
+    # A single row needs no step, and the last row no padding: some drivers omit them.
     needed = max(height - 1, 0) * row_step + width * point_step if height else 0
     fits = row_step >= width * point_step or height <= 1
     if not fits or data.size not in (needed, height * row_step) or data.size < needed:
@@ -95,11 +95,11 @@ def to_pointcloud2(
     """A labelled cloud as sensor_msgs/PointCloud2: fields x y z rgb label instance score, 28 bytes a point.
 
     label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` gives the names). instance: int32, -1
-    background, -2 unobserved, -3 too far. score: float32. rgb: a color a label, packed as PCL packs it.
-    stamp: a Time message, or nanoseconds since the epoch. messages: the library whose message is made.
-    xyz: (N, 3) coordinates in frame_id, where that is not the scene's world: the cloud as the sensor gave it.
-    double: write x y z as float64, which few viewers read; None: where float32 would round most of them by millimeters,
-    as those of a map in UTM. ROS counts in meters (REP 103).
+    background, -2 unobserved, -3 too far. score: float32. rgb: one color per label, packed as in PCL.
+    stamp: a Time message, or nanoseconds since the epoch. messages: factory of the message's library.
+    xyz: (N, 3) coordinates in frame_id, if that is not the scene's world: the sensor's cloud.
+    double: write x y z as float64, which few viewers read; None: if float32 would round most of them by millimeters,
+    as for a map in UTM. ROS units are meters (REP 103).
     """
     xyz = result.xyz if xyz is None else xyz
     if xyz.shape != (len(result), 3):
@@ -107,11 +107,11 @@ def to_pointcloud2(
     if double is None and xyz.dtype != np.float32:
         finite = np.abs(xyz[np.logical_and.reduce(np.isfinite(xyz), axis=1)])
         double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > MAX_FLOAT32_M
-    # One sub-array for x, y, z is filled at once; a view of the same bytes names the three.
+    # x, y, z are filled together as one sub-array; a view of the same bytes names the three.
     place = "<f8" if double else "<f4"
     colors = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
     rows = np.empty(len(result), [("xyz", place, 3), *colors])
-    with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite
         rows["xyz"] = xyz
     rows["rgb"] = _packed_colors(len(result.names))[result.labels]
     rows["label"] = np.where(result.labels < 0, UNLABELLED, result.labels)
@@ -123,9 +123,9 @@ def to_pointcloud2(
 def write_fields(
     rows: NDArray[Any], frame_id: str, stamp: Any = None, *, messages: MessageFactory = plain_messages
 ) -> Any:
-    """A PointCloud2 of a structured array (N,) or (height, width), its bytes as they are: ``read_fields`` undoes it.
+    """A PointCloud2 with the unchanged bytes of a structured array (N,) or (height, width); inverse of ``read_fields``.
 
-    SceneError for fields that are no numbers of one of the eight types, and for two byte orders in one array.
+    SceneError for fields that have none of the eight number types, and for two byte orders in one array.
     """
     rows = np.ascontiguousarray(np.atleast_2d(rows))
     columns = {name: column[:2] for name, column in (rows.dtype.fields or {}).items()}
@@ -133,7 +133,7 @@ def write_fields(
     known = all(kind.base.newbyteorder("=") in DATATYPES for kind, _ in columns.values())
     if not columns or len(orders) > 1 or not known:
         raise SceneError(f"a PointCloud2 cannot hold {rows.dtype}; expected fields of 8 to 32-bit integers and floats")
-    # A structured array's type says what PointFields say: names, offsets, types, counts.
+    # A structured dtype holds the same as PointFields: names, offsets, types, counts.
     height, width = rows.shape
     fields = [
         messages("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=count)
@@ -158,7 +158,7 @@ def _size(message: Any, name: str) -> int:
 
 
 def _dtype(fields: Any, point_step: int, byte_order: str) -> np.dtype[Any]:
-    """The fields as a structured type of point_step bytes; unnamed fields are padding."""
+    """The fields as a structured dtype of point_step bytes; unnamed fields are padding."""
     kinds: dict[str, tuple[Any, int]] = {}
     for field in fields:
         name, offset, count = field.name, int(field.offset), max(int(field.count), 1)  # PCL writes a count of 0 as 1
@@ -188,6 +188,6 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
 
 
 def _packed_colors(names: int) -> NDArray[np.float32]:
-    """(names + 1,) float32 whose bits are 0x00RRGGBB: a color a label, then unknown's, where label -1 finds it."""
+    """(names + 1,) float32 with bits 0x00RRGGBB: one color per label, then that of unknown, indexed by label -1."""
     red, green, blue = label_colors(np.append(np.arange(names), UNKNOWN)).astype(np.uint32).T
     return (red << 16 | green << 8 | blue).view(np.float32)

@@ -1,7 +1,7 @@
-"""A tree of frames over time, made from /tf and /tf_static: where one frame lies in another at a moment.
+"""A tree of frames over time, made from /tf and /tf_static: the pose of one frame in another at a time.
 
-A moment between two transforms is interpolated: places on a straight line, rotations on the shortest arc. Offline that
-is always possible, as all transforms are known beforehand. Before the first and after the last nothing is guessed.
+Between two transforms, translations are interpolated linearly and rotations on the shortest arc. Offline that is always
+possible, as all transforms are known in advance. There is no extrapolation before the first and after the last.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 MIN_QUATERNION_LENGTH = 1e-6
-"""Length below which a quaternion says nothing of a rotation."""
+"""Length below which a quaternion does not define a rotation."""
 MAX_CHAIN_FRAMES = 1000
-"""Length of a chain of frames, each in the next; robots have tens."""
+"""Maximum length of a chain of frames, each the child of the next; robots have tens."""
 NEARLY_EQUAL_COSINE = 1 - 1e-8
-"""Cosine of half the angle between two rotations above which the arc is straight, but for rounding."""
+"""Cosine of half the angle between two rotations above which the arc is straight up to rounding."""
 
 
 class TransformError(OgPointcloudError):
-    """Two frames are not connected, or not at the moment asked for."""
+    """Two frames are not connected, or not at the requested time."""
 
 
 @dataclass
 class _Edge:
-    """Where a frame lies in its parent: translation (3,) and unit quaternion x y z w at each stamp, ascending."""
+    """Pose of a frame in its parent: translation (3,) and unit quaternion x y z w at each stamp, ascending."""
 
     parent: str
     stamps: list[int] = field(default_factory=list)
@@ -40,7 +40,7 @@ class _Edge:
 
 
 class TransformTree:
-    """Frames by name, with a leading slash or without. Every frame has one parent, the latest that was added."""
+    """Frames by name, with or without a leading slash. Every frame has one parent, the latest one added."""
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
@@ -54,7 +54,7 @@ class TransformTree:
         self, parent: str, child: str, translation: ArrayLike, rotation_xyzw: ArrayLike, stamp: int = 0, *,
         static: bool = False,
     ) -> None:  # fmt: skip
-        """Add where child lies in parent: p_parent = R p_child + translation. stamp: nanoseconds.
+        """Add the pose of child in parent: p_parent = R p_child + translation. stamp: nanoseconds.
 
         A static transform holds at all times. TransformError for NaN, infinity, or a quaternion of length 0.
         """
@@ -70,7 +70,7 @@ class TransformTree:
         edge = self._edges.get(child)
         if edge is None or edge.parent != parent or edge.static != static or static:
             edge = self._edges[child] = _Edge(parent, static=static)
-        # In order of time, whatever the order of messages; of one stamp the later message counts.
+        # Sorted by time, whatever the order of messages; the later message of one stamp counts.
         at = bisect_left(edge.stamps, stamp)
         repeated = at < len(edge.stamps) and edge.stamps[at] == stamp
         edge.stamps[at : at + repeated] = [stamp]
@@ -86,9 +86,9 @@ class TransformTree:
             )  # fmt: skip
 
     def lookup(self, target: str, source: str, stamp: int) -> NDArray[np.float64]:
-        """(4, 4) float64 that takes coordinates of source to target at that moment, nanoseconds."""
+        """(4, 4) float64 from source to target coordinates. stamp: nanoseconds."""
         target, source = target.lstrip("/"), source.lstrip("/")
-        # Both chains of parents, up to the first frame that they share: out of the source, and into the target.
+        # Both chains of parents, up to the first common frame: out of the source, and into the target.
         down, up = self._to_root(source), self._to_root(target)
         if source != target and not set(down) & set(up):
             missing = [repr(frame) for frame in (target, source) if frame not in self.frames]
@@ -115,14 +115,14 @@ class TransformTree:
         return path
 
     def _chain(self, frames: list[str], stamp: int) -> NDArray[np.float64]:
-        """(4, 4) from coordinates of the first frame to those of the last one's parent; the identity without frames."""
+        """(4, 4) from the first frame to the last one's parent; the identity without frames."""
         matrix = np.eye(4)
         for frame in frames:
             matrix = self._pose(frame, stamp) @ matrix
         return matrix
 
     def _pose(self, frame: str, stamp: int) -> NDArray[np.float64]:
-        """(4, 4) from a frame to its parent at that moment; TransformError outside of what is known."""
+        """(4, 4) from a frame to its parent at that time; TransformError outside the known interval."""
         edge = self._edges[frame]
         if edge.static:
             return pose_of(*edge.poses[-1])
@@ -134,14 +134,14 @@ class TransformTree:
             raise TransformError(
                 f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f}, not at {asked:.3f} s"
             )
-        before = after - 1  # between two stamps: so far from one to the other
+        before = after - 1  # the fraction of the way between two stamps
         share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])
         (place, turn), (next_place, next_turn) = edge.poses[before], edge.poses[after]
         return pose_of(place + share * (next_place - place), slerp(turn, next_turn, share))
 
 
 def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """(4,) unit quaternion on the shortest arc between two, the first for share 0, the second for 1 (Shoemake 1985)."""
+    """(4,) unit quaternion on the shortest arc between two, the first at share 0, the second at 1 (Shoemake 1985)."""
     cosine = float(first @ second)
     if cosine < 0:  # q and -q are one rotation
         second, cosine = -second, -cosine
@@ -153,5 +153,5 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
 
 
 def pose_of(translation: ArrayLike, xyzw: ArrayLike) -> NDArray[np.float64]:
-    """(4, 4) of a translation (3,) and a quaternion x y z w, ROS's order, of any length but 0, else SceneError."""
+    """(4, 4) from a translation (3,) and a quaternion x y z w (ROS order) of any nonzero length, else SceneError."""
     return pose_of_quaternion(np.roll(np.asarray(xyzw, np.float64), 1), translation)
