@@ -135,7 +135,7 @@ def test_circumstances_are_not_in_the_files():
     whole, settings = Journal(False), FitSettings(memory=10**9)
     whole.leave_out(LeftOut.SPANNING_MASKS, count=1)
     kept = [
-        module._without_circumstances(one.provenance(replace(settings, memory=memory)), settings)
+        module._reproducible(one.provenance(replace(settings, memory=memory)), settings)
         for one, memory in ((journal, 10**8), (whole, 10**7))
     ]
     assert kept[0] == kept[1]
