@@ -84,27 +84,27 @@ MUTATIONS = (
     ),
     Mutation(
         "what is hardly seen is believed", "fitting/view_reports.py",
-        "sees, width = counts * openly[g],", "sees, width = counts,", MEMBERSHIP,
+        "p_seen, width = used_vote * visibility[g],", "p_seen, width = used_vote,", MEMBERSHIP,
     ),
     Mutation(
         "reports are counted however little a view sees", "fitting/view_reports.py",
-        "likely[c] * counts * openly[g] ** 2", "likely[c]", MEMBERSHIP,
+        "probability[c] * used_vote * visibility[g] ** 2", "probability[c]", MEMBERSHIP,
     ),
     Mutation(
         "views that look alike add up", "fitting/view_reports.py",
-        "max(1.0, seen / ENOUGH)", "1.0", MEMBERSHIP,
+        "max(1.0, total_seen / MAX_INDEPENDENT_VIEWS)", "1.0", MEMBERSHIP,
     ),
     Mutation(
         "no mask on a point costs nothing", "fitting/view_reports.py",
-        "np.where(found.masked, 0, -UNSEEN)", "np.where(found.masked, 0.0, 0.0)", MEMBERSHIP,
+        "np.where(candidates.in_mask, 0, -NO_MASK_LOG_PENALTY)", "np.where(candidates.in_mask, 0.0, 0.0)", MEMBERSHIP,
     ),
     Mutation(
         "background is as likely as any instance", "fitting/view_reports.py",
-        "= MORE_LIKELY", "+= 0.0", MEMBERSHIP,
+        "= BACKGROUND_LOG_PRIOR", "+= 0.0", MEMBERSHIP,
     ),
     Mutation(
         "what lies in a mask without a group lies in none", "fitting/view_reports.py",
-        "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)", MEMBERSHIP,
+        "used = max(vote - ungrouped, grouped)", "used = max(vote, grouped)", MEMBERSHIP,
     ),
     Mutation(
         "a mask that spans several things says nothing", "fitting/membership.py",
@@ -116,16 +116,16 @@ MUTATIONS = (
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",
-        "- APART, 0) * openly[other]", "- APART, 0)", MEMBERSHIP,
+        "- MIN_COLOR_RATIO, 0) * visibility[other]", "- MIN_COLOR_RATIO, 0)", MEMBERSHIP,
     ),
     Mutation(
         "neighbors are heard whatever their color", "fitting/view_reports.py",
-        "max(weights[g, j] - APART, 0)", "(weights[g, j] > 0) * (1 - APART)",
+        "max(weights[g, j] - MIN_COLOR_RATIO, 0)", "(weights[g, j] > 0) * (1 - MIN_COLOR_RATIO)",
         (*hard("votes-borders_by_color"), "test_view_reports.py"),
     ),
     Mutation(
         "neighbors are heard although their color says another thing", "fitting/view_reports.py",
-        "max(weights[g, j] - APART, 0)", "weights[g, j]", MEMBERSHIP,
+        "max(weights[g, j] - MIN_COLOR_RATIO, 0)", "weights[g, j]", MEMBERSHIP,
     ),
     Mutation(
         "a part of a scene counts its own reports", "fitting/view_reports.py",

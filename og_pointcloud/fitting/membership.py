@@ -130,7 +130,7 @@ def assign_points(
     )
     possible = (support.share > settings.possible_share) & (support.share_openly > settings.possible_openly)
     ids = _completed(likely.ids, support, possible, (table, groups.told), around, weights, settings)
-    certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
+    certainty = likely.probability_of(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids, certainty.astype(np.float32), likely.expected_iou(ids), rate.astype(np.float32), dismissed,
         SceneVotes(typical, reports),
