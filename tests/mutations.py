@@ -153,7 +153,7 @@ MUTATIONS = (
     ),
     Mutation(
         "islands by votes alone stay", "fitting/membership.py",
-        "(~majority[own] |", "((own < 0) |", (*MEMBERSHIP, "test_membership.py"),
+        "(~majority[part] |", "((part < 0) |", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "noise of one view is an instance", "fitting/membership.py",
@@ -161,15 +161,16 @@ MUTATIONS = (
     ),
     Mutation(
         "what one view alone has a mask of is a thing", "fitting/membership.py",
-        "(chance < settings.missed_chance)", "(chance < 0)", ("test_membership.py",),
+        "(p_missed < settings.missed_chance)", "(p_missed < 0)", ("test_membership.py",),
     ),
     Mutation(
         "whatever other views mask, one view is alone", "fitting/membership.py",
-        "(views == 1) & (of_group(masked - support.votes) < 0.5 * points)", "views == 1", ("test_membership.py",),
+        "(views == 1) & (per_group(masked - support.votes) < 0.5 * points)", "views == 1", ("test_membership.py",),
     ),
     Mutation(
         "what slips past an edge is grown over", "fitting/membership.py",
-        "(support.share_openly > settings.possible_openly)", "(support.share > 0)", (*MEMBERSHIP, "test_membership.py"),
+        "(support.reweighted_share > settings.possible_openly)", "(support.share > 0)",
+        (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "one vote of many makes a point clear", "fitting/membership.py",
@@ -178,7 +179,7 @@ MUTATIONS = (
     ),
     Mutation(
         "certainty without the neighbors", "fitting/membership.py",
-        "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
+        "agreement[g] = same / count", "agreement[g] = 1", MEMBERSHIP,
     ),
     Mutation(
         "what an instance lacks is not expected of it", "fitting/view_reports.py",
@@ -204,7 +205,7 @@ MUTATIONS = (
     ),
     Mutation(
         "points are not asked which masks span things", "fitting/membership.py",
-        "if (known.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
+        "if (marked.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
     ),
     Mutation(
         "crumbs make masks span", "fitting/grouping.py",

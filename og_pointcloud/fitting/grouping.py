@@ -50,7 +50,7 @@ class MaskGroups:
     spanning: NDArray[np.bool_]
 
     @property
-    def told(self) -> NDArray[np.int32]:
+    def voting_group(self) -> NDArray[np.int32]:
         """(masks,) int32, the group that each mask tells points to be of, -1 none: spanning masks tell of no single
         one."""
         return np.where(self.spanning, -1, self.group).astype(np.int32)

@@ -33,7 +33,7 @@ from og_pointcloud.fitting.learned.matching import (
 )
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import settled_points
+from og_pointcloud.fitting.membership import assign_and_mark_spanning
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -213,7 +213,7 @@ def _decided_by_views(
     """
     with journal.stage("membership"):
         rgb = surface.scene.points.rgb
-        groups, membership = settled_points(table, votes, groups, surface.neighborhood, settings, rgb)
+        groups, membership = assign_and_mark_spanning(table, votes, groups, surface.neighborhood, settings, rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     if membership.dismissed.any():

@@ -35,7 +35,7 @@ from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
-from og_pointcloud.fitting.membership import SceneVotes, assign_points, settled_points
+from og_pointcloud.fitting.membership import SceneVotes, assign_and_mark_spanning, assign_points
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.see_through import without_see_through
@@ -413,7 +413,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     around = neighborhood(cloud.points.xyz[sample], settings.geometry)
     rgb = cloud.points.rgb
     rgb = None if rgb is None else rgb[sample]
-    groups, judged = settled_points(table, votes, groups, around, settings, rgb)
+    groups, judged = assign_and_mark_spanning(table, votes, groups, around, settings, rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     # Groups of which the sample shows no sure point have rate 0: of these the tiles know more.
