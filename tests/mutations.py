@@ -209,7 +209,7 @@ MUTATIONS = (
     ),
     Mutation(
         "crumbs make masks span", "fitting/grouping.py",
-        "held > settings.spanning_share * whole", "held > 0", ("test_grouping.py",),
+        "held > settings.spanning_share * total", "held > 0", ("test_grouping.py",),
     ),
     Mutation(
         "masks that span objects take part", "fitting/grouping.py",

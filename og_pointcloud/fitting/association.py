@@ -26,7 +26,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.grouping import cosines_of_different
+from og_pointcloud.fitting.grouping import cosines_within_views
 from og_pointcloud.fitting.mask_table import MaskTable
 
 MOSTLY = 0.5
@@ -61,7 +61,7 @@ def describe_instances(
     # Masks that show nothing of their instance, or have no feature, say nothing of what it is.
     described = features.any(axis=1)
     of_instance = members_of(np.where((shown > 0) & described, group, -1), count)
-    alike = _least_alike(features, of_instance, cosines_of_different(features[described], table.mask_view[described]))
+    alike = _least_alike(features, of_instance, cosines_within_views(features[described], table.mask_view[described]))
     for instance, members in enumerate(of_instance):
         weight = np.cbrt(shown[members])
         main = main_kind(features[members], weight, alike)

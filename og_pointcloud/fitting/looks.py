@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.association import directions, members_of, shown_of_instance
-from og_pointcloud.fitting.grouping import cosines_of_different
+from og_pointcloud.fitting.grouping import cosines_within_views
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 
@@ -41,7 +41,7 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
     described = features.any(axis=1)
     usable = (group >= 0) & (shown > 0) & described
     # What the encoder says of different things here, so that no threshold depends on the encoder.
-    cosines = cosines_of_different(features[described], table.mask_view[described])
+    cosines = cosines_within_views(features[described], table.mask_view[described])
     unlike = float(np.median(cosines)) if len(cosines) else 0.0
     look, owner = group.copy(), list(range(count))
     for index, members in enumerate(members_of(np.where(usable, group, -1), count)):
