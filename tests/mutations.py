@@ -137,7 +137,7 @@ MUTATIONS = (
     ),
     Mutation(
         "few colors say as much as many", "fitting/colors.py",
-        "one, other = one + prior, other + prior", "one, other = one, other", ("test_seen_colors.py",),
+        "first, second = first + prior, second + prior", "first, second = first, second", ("test_seen_colors.py",),
     ),
     Mutation(
         "colors of points that views are not sure of are asked", "fitting/colors.py",
@@ -234,7 +234,8 @@ MUTATIONS = (
     ),
     Mutation(
         "the mean of all that a thing is called", "fitting/association.py",
-        "if first > CLEARLY * second else everyone", "if first > 9 * second else everyone", ("test_association.py",),
+        "if first > DOMINANT_WEIGHT_RATIO * second else all_rows", "if first > 9 * second else all_rows",
+        ("test_association.py",),
     ),
     # Learned modes.
     Mutation(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 
 from og_pointcloud.fitting.holes import STRAIGHT_EDGE, WINDOW, seen_through_holes
-from og_pointcloud.fitting.mask_table import SEEN_THROUGH
+from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE
 from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
@@ -120,7 +120,7 @@ def test_what_shows_through_a_hole_keeps_a_little_of_its_weight() -> None:
     assert (kept[:400] == 1).all()
     through = kept[400:] < 1
     assert through.mean() > 0.6
-    np.testing.assert_allclose(kept[400:][through], SEEN_THROUGH, rtol=1e-6)
+    np.testing.assert_allclose(kept[400:][through], SEEN_THROUGH_SHARE, rtol=1e-6)
     np.testing.assert_allclose(after.exposure.toarray()[0], exposed * kept, rtol=1e-6)
     # What masks have in common is compared as if there were no hole.
     assert after.doubted.nnz == through.sum()

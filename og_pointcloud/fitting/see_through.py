@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.holes import seen_through_holes
-from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
+from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE, MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import Gaussians, seen_from
@@ -25,7 +25,7 @@ def without_see_through(
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
     """Take from each mask what does not lie at its object's depth, mostly behind it. The view is then blind to that: it
-    neither says "in the mask" nor "not". What shows through holes of the object keeps SEEN_THROUGH of its weight
+    neither says "in the mask" nor "not". What shows through holes of the object keeps SEEN_THROUGH_SHARE of its weight
     (holes.py).
 
     A mask shows a front surface. Sorted by depth, its points fall into runs, parted by gaps wider than a share of the
@@ -97,7 +97,7 @@ def _at_front(
         order, depth, weight = order[front], depth[front], weight[front]
         gap = settings.hole_sizes * size * (depth[(len(depth) - 1) // 2] + depth[len(depth) // 2]) / 2  # the median's
         kept[order] = 1
-        kept[order[seen_through_holes(xy[order], depth, weight, area, gap, share)]] = SEEN_THROUGH
+        kept[order[seen_through_holes(xy[order], depth, weight, area, gap, share)]] = SEEN_THROUGH_SHARE
     return kept
 
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.fitting.colors import DIFFERENCES
+from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
@@ -40,11 +40,11 @@ from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.fitting.seen_colors import (
-    NO_COLOR,
-    believed,
+    NO_DIFFERENCE,
     differences,
     sight_ratios,
     warn_of_faults,
+    with_color_evidence,
     with_photograph,
 )
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
@@ -247,7 +247,7 @@ class _Shown:
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
         table = MaskTable(weights, outside, exposure, *masks_of_views, doubted=through)
-        return self.photographs.joined(believed(table, np.concatenate(difference), self.sight_ratios))
+        return self.photographs.joined(with_color_evidence(table, np.concatenate(difference), self.sight_ratios))
 
 
 def _stacked(
@@ -258,7 +258,7 @@ def _stacked(
     matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 4, points))
     outside, exposure, through, apart = (csr_array(matrix[row : row + 1]) for row in range(masks, masks + 4))
     # Every exposure has its difference, of the same points in the same order; or none has, without a photograph.
-    difference = apart.data - 1 if apart.nnz else np.full(exposure.nnz, NO_COLOR)
+    difference = apart.data - 1 if apart.nnz else np.full(exposure.nnz, NO_DIFFERENCE)
     return csr_array(matrix[:masks]), outside, exposure, through, difference.astype(np.uint16)
 
 
@@ -327,7 +327,7 @@ def _entries(
     rows, larger, inside = _worth_drawing(view, cloud, drawing)
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
-        return np.zeros(0, ENTRY), counts, np.zeros((2, DIFFERENCES))
+        return np.zeros(0, ENTRY), counts, np.zeros((2, COLOR_DIFFERENCE_BINS))
     splats = drawing.splats(cloud, rows, larger, settings.geometry.opacity)
     thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
     table = mask_table(splats, [view], drawing.near, thickness, by_sight=True)
