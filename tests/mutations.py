@@ -270,7 +270,7 @@ MUTATIONS = (
     ),
     Mutation(
         "what lies behind a rim shows through a hole", "fitting/holes.py",
-        "return np.sqrt(x**2 + y**2) < STRAIGHT_EDGE * count", "return count > 0", ("test_holes.py",),
+        "return np.sqrt(x**2 + y**2) < HALF_PLANE_MEAN_DIRECTION * count", "return count > 0", ("test_holes.py",),
     ),
     Mutation(
         "a kind counts for each of its descriptors", "ask/choosing.py",

@@ -25,7 +25,7 @@ from og_pointcloud.fitting.membership import (
     assign_points,
     instance_area,
 )
-from og_pointcloud.fitting.see_through import _object, without_see_through
+from og_pointcloud.fitting.see_through import _front_run, without_see_through
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes, votes_of_points
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
@@ -432,7 +432,7 @@ def test_the_object_of_a_mask_is_that_of_the_literal_reference(seed: int) -> Non
     run = np.concatenate([[0], np.cumsum(np.diff(depth) > gap_share * middle)])
     mass = np.bincount(run, weight)
     assert len(mass) > 1
-    begin, end = _object(depth, weight, gap_share, front_share)
+    begin, end = _front_run(depth, weight, gap_share, front_share)
     np.testing.assert_array_equal(
         np.flatnonzero(run == np.argmax(mass >= front_share * mass.sum())), np.arange(begin, end)
     )

@@ -178,7 +178,7 @@ def part_of(
     of_instance = csr_array((np.ones(len(rows)), (rows, instance_ids[rows])), shape=(len(instance_ids), count))
     of_view = csr_array((np.ones(masks), (table.mask_view, np.arange(masks))), shape=(table.outside.shape[0], masks))
     # What each mask, and each view, shows of each instance; which views show enough of it, and which have a mask of it.
-    shown = (table.weights @ of_instance).tocoo()  # (masks, count), dense, ten thousand instances take gigabytes
+    shown = (table.weights @ of_instance).tocoo()  # (masks, count), sparse: gigabytes if dense
     seen = (table.outside @ of_instance + of_view @ shown).toarray()  # (views, count), in masks and outside
     sees = seen > MIN_VISIBLE_SHARE * _typical(seen)
     owned = np.flatnonzero(mask_instance >= 0)
@@ -194,7 +194,7 @@ def part_of(
     # A whole must have more points than its part, so that there are no cycles.
     size = np.bincount(instance_ids[rows], minlength=count)
     holds = within & (whole >= 0) & sees[view, whole] & has_own_mask[part] & (size[whole] > size[part])
-  
+    # For each pair (part, whole): views that hold it, of those that could: that see both and have a mask of the whole.
     pairs, held = np.unique(np.stack([part[holds], whole[holds]]), axis=1, return_counts=True)
     part, whole = pairs[:, held >= MIN_PART_VIEWS]
     possible = [np.count_nonzero(sees[:, a] & sees[:, b] & has_mask[:, b]) for a, b in zip(part, whole, strict=True)]
