@@ -205,7 +205,7 @@ def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     return cloud
 
 
-def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
+def test_every_point_that_shows_is_points_to_draw(monkeypatch, tmp_path):
     monkeypatch.setattr(tiles, "MIN_SPACING_PX", 1e-6)
     random = np.random.default_rng(3)
     points = Points((4 * random.normal(size=(4000, 3))).astype(np.float32), np.zeros(3))
@@ -216,7 +216,7 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
     # So faint that nothing hides anything.
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32), 0.01)
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._points_to_draw(view, cloud, drawing)
     assert len(shows) > 250
     assert set(shows) <= set(rows)
     assert len(rows) == inside < 2000
@@ -233,14 +233,14 @@ def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch, tmp_path):
         Points(xyz, np.zeros(3)), 0.00625, WorkFolder(tmp_path)
     )  # a quarter of a pixel, half of MIN_SPACING_PX
     drawing = tiles._Drawing(0.5, 0.1, 0.00625)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._points_to_draw(view, cloud, drawing)
     assert inside == 40_000
     assert len(rows) == pytest.approx(10_000, rel=0.05)
     np.testing.assert_allclose(larger, 2, rtol=1e-3)
-    others, _, _ = tiles._worth_drawing(replace(view, name="other"), cloud, drawing)
+    others, _, _ = tiles._points_to_draw(replace(view, name="other"), cloud, drawing)
     assert len(np.intersect1d(rows, others)) == pytest.approx(2_500, rel=0.1)
     monkeypatch.setattr(tiles, "MAX_SPLATS", 3_000)
-    rows, larger, _ = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, _ = tiles._points_to_draw(view, cloud, drawing)
     assert 2_000 < len(rows) < 3_200
     assert (larger**2).sum() == pytest.approx(40_000, rel=0.05)
 

@@ -98,7 +98,7 @@ def _begin() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of what a shell starts in the background
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in what a shell starts in the background
         signal.signal(signal.SIGINT, _end)
     _hold_interrupts(False)
 

@@ -148,7 +148,7 @@ def vanished() -> NoReturn:
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
     """The spacing that 95 % of the points do not exceed, by a sample of them."""
-    # Built fast rather than asked fast: few points are looked up. The first neighbor is the point itself.
+    # Fast to build rather than to query: few points are looked up. The first neighbor is the point itself.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
     distance, _ = tree.query(xyz[:: 1 + len(xyz) // SPACING_SAMPLE_POINTS], k=[2, 3, 4])
     known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points

@@ -293,7 +293,7 @@ def _all_shown(scene: Scene, cloud: TiledCloud, rendered: Sequence[_RenderedView
 class _RenderedView:
     """A view in the work folder. first: (tiles + 1,), as in `_Shown`. masked: how many of its entries are in masks.
     drawn: how many points were drawn, and how many there are in the image. colors: as `differences` counts them.
-    was_there: since an earlier run. fault: of its photograph, as of `with_photograph`."""
+    was_there: from an earlier run. fault: of its photograph, from `with_photograph`."""
 
     key: str
     first: Rows
@@ -360,7 +360,7 @@ def _points_to_draw(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[R
     """
     parts = [_in_image(view.camera, cloud, cloud.tiles.part(tile), drawing) for tile in range(len(cloud.tiles))]
     rows, spacing_px = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    # A point's probability leaves a surface's points ``finest`` apart: squared, because it is of an area.
+    # A point's probability leaves a surface's points ``finest`` apart: squared, as areas scale.
     finest = MIN_SPACING_PX
     while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MAX_SPLATS:
         finest *= 1.2
@@ -427,7 +427,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
 
 @dataclass(frozen=True)
 class _Decided:
-    """What is known of a tile's inner points. ids, certainty: as of `Membership`, but ids are of looks. in_masks:
+    """What is known of a tile's inner points. ids, certainty: as in `Membership`, but ids are looks. in_masks:
     (masks, looks), outside: (views, looks), sparse, what shows of each look's points in each mask, and outside."""
 
     ids: NDArray[np.int32]
