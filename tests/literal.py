@@ -165,14 +165,15 @@ def _likely_states(
         in_masks.append({k for r in reported for k in within.get(r, [r])})
         may.append({*in_masks[g], *near, background} if votes.weight[:, g].any() else set())
     likely = [{k: float(k == (background if clear[g] == BACKGROUND else clear[g])) for k in may[g]} for g in points]
-    for _ in range(by.COUNTED):
+    for _ in range(by.EM_ROUNDS):
         chance = np.zeros((views, background + 1, background + 1))
         for view, k in np.ndindex(views, background + 1):
-            chance[view, k, k if (view, k) in shown else background] = by.EXPECTED
+            chance[view, k, k if (view, k) in shown else background] = by.PRIOR_COUNT
             for g in points:
                 sees = said[view, :, g].sum() * open_[g]
                 chance[view, k] += likely[g].get(k, 0) * sees * open_[g] * said[view, :, g]
-            chance[view, k] = (1 - by.LEAST) * chance[view, k] / chance[view, k].sum() + by.LEAST
+            least = by.MIN_REPORT_PROBABILITY
+            chance[view, k] = (1 - least) * chance[view, k] / chance[view, k].sum() + least
         evidence: list[dict[int, float]] = []
         for g in points:
             sees, of_point = said[:, :, g].sum(axis=1) * open_[g], {}
@@ -180,17 +181,19 @@ def _likely_states(
                 total = 0.0
                 for view in np.flatnonzero(sees):
                     part = said[view, :, g] / said[view, :, g].sum()
-                    total += part @ np.log(sees[view] * chance[view, k] + (1 - sees[view]) * by.HIDDEN)
-                prior = by.MORE_LIKELY if k == background else 0 if k in in_masks[g] else -by.UNSEEN
-                of_point[k] = total / max(1, sees.sum() / by.ENOUGH) + prior
+                    hidden = (1 - sees[view]) * by.HIDDEN_REPORT_PROBABILITY
+                    total += part @ np.log(sees[view] * chance[view, k] + hidden)
+                of_instance = 0 if k in in_masks[g] else -by.NO_MASK_LOG_PENALTY
+                prior = by.BACKGROUND_LOG_PRIOR if k == background else of_instance
+                of_point[k] = total / max(1, sees.sum() / by.MAX_INDEPENDENT_VIEWS) + prior
             evidence.append(of_point)
         likely = [dict.fromkeys(of, 0.0) for of in may]
-        for _ in range(1 + by.ROUNDS):
+        for _ in range(1 + by.MEAN_FIELD_ROUNDS):
             before, likely = likely, []
             for g in points:
                 heard = {
                     k: evidence[g][k] + by.SMOOTHNESS * sum(
-                        max(alike[g, other] - by.APART, 0) * open_[other] * before[other].get(k, 0)
+                        max(alike[g, other] - by.MIN_COLOR_RATIO, 0) * open_[other] * before[other].get(k, 0)
                         for other in neighbors[g]
                     )
                     for k in may[g]

@@ -84,27 +84,27 @@ MUTATIONS = (
     ),
     Mutation(
         "what is hardly seen is believed", "fitting/view_reports.py",
-        "sees, width = counts * openly[g],", "sees, width = counts,", MEMBERSHIP,
+        "p_seen, width = used_vote * visibility[g],", "p_seen, width = used_vote,", MEMBERSHIP,
     ),
     Mutation(
         "reports are counted however little a view sees", "fitting/view_reports.py",
-        "likely[c] * counts * openly[g] ** 2", "likely[c]", MEMBERSHIP,
+        "probability[c] * used_vote * visibility[g] ** 2", "probability[c]", MEMBERSHIP,
     ),
     Mutation(
         "views that look alike add up", "fitting/view_reports.py",
-        "max(1.0, seen / ENOUGH)", "1.0", MEMBERSHIP,
+        "max(1.0, total_seen / MAX_INDEPENDENT_VIEWS)", "1.0", MEMBERSHIP,
     ),
     Mutation(
         "no mask on a point costs nothing", "fitting/view_reports.py",
-        "np.where(found.masked, 0, -UNSEEN)", "np.where(found.masked, 0.0, 0.0)", MEMBERSHIP,
+        "np.where(candidates.in_mask, 0, -NO_MASK_LOG_PENALTY)", "np.where(candidates.in_mask, 0.0, 0.0)", MEMBERSHIP,
     ),
     Mutation(
         "background is as likely as any instance", "fitting/view_reports.py",
-        "= MORE_LIKELY", "+= 0.0", MEMBERSHIP,
+        "= BACKGROUND_LOG_PRIOR", "+= 0.0", MEMBERSHIP,
     ),
     Mutation(
         "what lies in a mask without a group lies in none", "fitting/view_reports.py",
-        "counts = max(vote - lost, grouped)", "counts = max(vote, grouped)", MEMBERSHIP,
+        "used = max(vote - ungrouped, grouped)", "used = max(vote, grouped)", MEMBERSHIP,
     ),
     Mutation(
         "a mask that spans several things says nothing", "fitting/membership.py",
@@ -116,16 +116,16 @@ MUTATIONS = (
     ),
     Mutation(
         "neighbors are heard however little is seen of them", "fitting/view_reports.py",
-        "- APART, 0) * openly[other]", "- APART, 0)", MEMBERSHIP,
+        "- MIN_COLOR_RATIO, 0) * visibility[other]", "- MIN_COLOR_RATIO, 0)", MEMBERSHIP,
     ),
     Mutation(
         "neighbors are heard whatever their color", "fitting/view_reports.py",
-        "max(weights[g, j] - APART, 0)", "(weights[g, j] > 0) * (1 - APART)",
+        "max(weights[g, j] - MIN_COLOR_RATIO, 0)", "(weights[g, j] > 0) * (1 - MIN_COLOR_RATIO)",
         (*hard("votes-borders_by_color"), "test_view_reports.py"),
     ),
     Mutation(
         "neighbors are heard although their color says another thing", "fitting/view_reports.py",
-        "max(weights[g, j] - APART, 0)", "weights[g, j]", MEMBERSHIP,
+        "max(weights[g, j] - MIN_COLOR_RATIO, 0)", "weights[g, j]", MEMBERSHIP,
     ),
     Mutation(
         "a part of a scene counts its own reports", "fitting/view_reports.py",
@@ -137,7 +137,7 @@ MUTATIONS = (
     ),
     Mutation(
         "few colors say as much as many", "fitting/colors.py",
-        "one, other = one + prior, other + prior", "one, other = one, other", ("test_seen_colors.py",),
+        "first, second = first + prior, second + prior", "first, second = first, second", ("test_seen_colors.py",),
     ),
     Mutation(
         "colors of points that views are not sure of are asked", "fitting/colors.py",
@@ -153,7 +153,7 @@ MUTATIONS = (
     ),
     Mutation(
         "islands by votes alone stay", "fitting/membership.py",
-        "(~majority[own] |", "((own < 0) |", (*MEMBERSHIP, "test_membership.py"),
+        "(~majority[part] |", "((part < 0) |", (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "noise of one view is an instance", "fitting/membership.py",
@@ -161,15 +161,16 @@ MUTATIONS = (
     ),
     Mutation(
         "what one view alone has a mask of is a thing", "fitting/membership.py",
-        "(chance < settings.missed_chance)", "(chance < 0)", ("test_membership.py",),
+        "(p_missed < settings.missed_chance)", "(p_missed < 0)", ("test_membership.py",),
     ),
     Mutation(
         "whatever other views mask, one view is alone", "fitting/membership.py",
-        "(views == 1) & (of_group(masked - support.votes) < 0.5 * points)", "views == 1", ("test_membership.py",),
+        "(views == 1) & (per_group(masked - support.votes) < 0.5 * points)", "views == 1", ("test_membership.py",),
     ),
     Mutation(
         "what slips past an edge is grown over", "fitting/membership.py",
-        "(support.share_openly > settings.possible_openly)", "(support.share > 0)", (*MEMBERSHIP, "test_membership.py"),
+        "(support.reweighted_share > settings.possible_openly)", "(support.share > 0)",
+        (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "one vote of many makes a point clear", "fitting/membership.py",
@@ -178,7 +179,7 @@ MUTATIONS = (
     ),
     Mutation(
         "certainty without the neighbors", "fitting/membership.py",
-        "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
+        "agreement[g] = same / count", "agreement[g] = 1", MEMBERSHIP,
     ),
     Mutation(
         "what an instance lacks is not expected of it", "fitting/view_reports.py",
@@ -204,11 +205,11 @@ MUTATIONS = (
     ),
     Mutation(
         "points are not asked which masks span things", "fitting/membership.py",
-        "if (known.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
+        "if (marked.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
     ),
     Mutation(
         "crumbs make masks span", "fitting/grouping.py",
-        "held > settings.spanning_share * whole", "held > 0", ("test_grouping.py",),
+        "held > settings.spanning_share * total", "held > 0", ("test_grouping.py",),
     ),
     Mutation(
         "masks that span objects take part", "fitting/grouping.py",
@@ -233,7 +234,8 @@ MUTATIONS = (
     ),
     Mutation(
         "the mean of all that a thing is called", "fitting/association.py",
-        "if first > CLEARLY * second else everyone", "if first > 9 * second else everyone", ("test_association.py",),
+        "if first > DOMINANT_WEIGHT_RATIO * second else all_rows", "if first > 9 * second else all_rows",
+        ("test_association.py",),
     ),
     # Learned modes.
     Mutation(
@@ -268,7 +270,7 @@ MUTATIONS = (
     ),
     Mutation(
         "what lies behind a rim shows through a hole", "fitting/holes.py",
-        "return np.sqrt(x**2 + y**2) < STRAIGHT_EDGE * count", "return count > 0", ("test_holes.py",),
+        "return np.sqrt(x**2 + y**2) < HALF_PLANE_MEAN_DIRECTION * count", "return count > 0", ("test_holes.py",),
     ),
     Mutation(
         "a kind counts for each of its descriptors", "ask/choosing.py",

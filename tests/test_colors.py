@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 from test_membership import groups, on_a_line
 
-from og_pointcloud.fitting.colors import DIFFERENCES, MOST, color_ratios, neighbor_weights
+from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS, MAX_COLOR_RATIO, color_ratios, neighbor_weights
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
@@ -56,8 +56,8 @@ def test_ratios_stay_within_their_bounds_where_colors_tell_all() -> None:
     random = np.random.default_rng(0)
     around, ids, sure = grid(random, 8 * SIDE)
     found = color_ratios(colored(ids, random, 0), ids, sure, around)
-    assert found.max() == pytest.approx(MOST)
-    assert found.min() == pytest.approx(1 / MOST)
+    assert found.max() == pytest.approx(MAX_COLOR_RATIO)
+    assert found.min() == pytest.approx(1 / MAX_COLOR_RATIO)
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -77,7 +77,7 @@ def test_a_scene_without_colors_or_without_borders_is_not_asked() -> None:
     around, ids, sure = grid(random)
     for rgb, states in ((None, ids), (colored(ids, random, 5), np.zeros_like(ids))):
         found = color_ratios(rgb, states, sure, around)
-        assert found.shape == (DIFFERENCES,)
+        assert found.shape == (COLOR_DIFFERENCE_BINS,)
         assert (found == 1).all()
         assert np.array_equal(neighbor_weights(rgb, around, found), around.adjoining)
 

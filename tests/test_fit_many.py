@@ -299,7 +299,7 @@ def test_a_cluster_that_is_not_there(monkeypatch):
         with pytest.raises(MissingExtraError, match="cluster"), dask_executor("tcp://127.0.0.1:1"):
             pass
         return
-    monkeypatch.setattr("og_pointcloud.fitting.tasks.PATIENCE_S", 0.5)
+    monkeypatch.setattr("og_pointcloud.fitting.tasks.CONNECT_TIMEOUT_S", 0.5)
     with pytest.raises(OgPointcloudError, match="no scheduler answers"), dask_executor("tcp://127.0.0.1:1"):
         pass
 

@@ -337,7 +337,7 @@ def test_a_mask_that_holds_most_of_two_groups_spans_them(held: range, spans: boo
     found = with_spanning(groups, view_votes(table), table.mask_view, ids, SETTINGS)
     assert found.spanning.tolist() == [False] * 4 + [spans]
     assert found.group.tolist() == groups.group.tolist()  # it keeps its name
-    assert found.told.tolist() == [0, 1, 0, 1, -1 if spans else 0]
+    assert found.voting_group.tolist() == [0, 1, 0, 1, -1 if spans else 0]
 
 
 def test_a_crumb_of_another_group_makes_no_mask_span() -> None:

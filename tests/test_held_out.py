@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 import og_pointcloud as og
 from og_pointcloud.fitting import held_out
-from og_pointcloud.fitting.held_out import CLEARLY, STEP, agreement, choose_scale, search
+from og_pointcloud.fitting.held_out import MIN_AGREEMENT_GAIN, SCALE_STEP, agreement, choose_scale, search
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import near_plane, neighborhood
@@ -53,15 +53,15 @@ def test_the_search_goes_on_beyond_the_largest_while_that_is_clearly_better(scen
     """Points as fine as a tenth of their spacing: rays slip between them."""
     choice = chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.1, 0.15))))
     assert choice.scale > 0.15
-    assert choice.agreements[choice.scale] >= choice.agreements[0.15] + CLEARLY
+    assert choice.agreements[choice.scale] >= choice.agreements[0.15] + MIN_AGREEMENT_GAIN
 
 
 @pytest.mark.parametrize(
     ("optimum", "found", "tried"),
     [
         (0.35, 0.35, {0.25}),  # the smallest, but one beyond is not better
-        (0.2, 0.25 / STEP, {0.25, 0.25 / STEP, 0.25 / STEP**2}),
-        (1.5, 0.7 * STEP**2, {0.7 * STEP, 0.7 * STEP**2, 0.7 * STEP**3}),
+        (0.2, 0.25 / SCALE_STEP, {0.25, 0.25 / SCALE_STEP, 0.25 / SCALE_STEP**2}),
+        (1.5, 0.7 * SCALE_STEP**2, {0.7 * SCALE_STEP, 0.7 * SCALE_STEP**2, 0.7 * SCALE_STEP**3}),
         (0.5, 0.5, set()),
     ],
 )

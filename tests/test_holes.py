@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 
-from og_pointcloud.fitting.holes import STRAIGHT_EDGE, WINDOW, seen_through_holes
-from og_pointcloud.fitting.mask_table import SEEN_THROUGH
+from og_pointcloud.fitting.holes import HALF_PLANE_MEAN_DIRECTION, WINDOW_POINTS, seen_through_holes
+from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE
 from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
@@ -35,7 +35,7 @@ def literal(xy: Doubles, depth: Doubles, weight: Doubles, area: float, gap: floa
     """The same, point by point."""
     n, low = len(depth), xy.min(axis=0)
     wide, high = np.ptp(xy, axis=0)
-    cell = max(np.sqrt(max(area * WINDOW / 9, wide * high / 4) / n), (wide + high) / (4 * n), 1e-12)
+    cell = max(np.sqrt(max(area * WINDOW_POINTS / 9, wide * high / 4) / n), (wide + high) / (4 * n), 1e-12)
     cells = ((xy - low) / cell).astype(int)
     hidden = []
     for point in range(n):
@@ -49,7 +49,7 @@ def literal(xy: Doubles, depth: Doubles, weight: Doubles, area: float, gap: floa
             continue
         away = xy[runs[front[0]]] - xy[point]
         mean = (away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0)
-        hidden.append(bool(np.linalg.norm(mean) < STRAIGHT_EDGE))
+        hidden.append(bool(np.linalg.norm(mean) < HALF_PLANE_MEAN_DIRECTION))
     return hidden
 
 
@@ -120,7 +120,7 @@ def test_what_shows_through_a_hole_keeps_a_little_of_its_weight() -> None:
     assert (kept[:400] == 1).all()
     through = kept[400:] < 1
     assert through.mean() > 0.6
-    np.testing.assert_allclose(kept[400:][through], SEEN_THROUGH, rtol=1e-6)
+    np.testing.assert_allclose(kept[400:][through], SEEN_THROUGH_SHARE, rtol=1e-6)
     np.testing.assert_allclose(after.exposure.toarray()[0], exposed * kept, rtol=1e-6)
     # What masks have in common is compared as if there were no hole.
     assert after.doubted.nnz == through.sum()

@@ -19,13 +19,13 @@ from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
     _clear,
-    _share_openly,
+    _reweighted_share,
     _Support,
     _without_islands,
     assign_points,
     instance_area,
 )
-from og_pointcloud.fitting.see_through import _object, without_see_through
+from og_pointcloud.fitting.see_through import _front_run, without_see_through
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes, votes_of_points
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
@@ -332,7 +332,7 @@ def test_the_share_of_open_views_is_that_of_the_literal_reference(seed: int) -> 
     group, best = np.array(numbers, np.int32), random.integers(-1, 5, 200).astype(np.int32)
     votes, has_mask = view_votes(table), random.uniform(size=(5, 6)) < 0.5
     columns = votes_of_points(votes)[0]()
-    share = _share_openly(*columns, group, table.mask_view, has_mask, best)
+    share = _reweighted_share(*columns, group, table.mask_view, has_mask, best)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     of_view = votes_of_views(in_mask, group, table.mask_view)
     for point, k in enumerate(best):
@@ -432,7 +432,7 @@ def test_the_object_of_a_mask_is_that_of_the_literal_reference(seed: int) -> Non
     run = np.concatenate([[0], np.cumsum(np.diff(depth) > gap_share * middle)])
     mass = np.bincount(run, weight)
     assert len(mass) > 1
-    begin, end = _object(depth, weight, gap_share, front_share)
+    begin, end = _front_run(depth, weight, gap_share, front_share)
     np.testing.assert_array_equal(
         np.flatnonzero(run == np.argmax(mass >= front_share * mass.sum())), np.arange(begin, end)
     )
@@ -490,6 +490,6 @@ def test_a_piece_apart_stays_by_the_majority_of_its_votes(votes: float, stays: b
     xyz = np.concatenate([grid, grid[:40] + np.array([100.0, 0, 0])]).astype(np.float32)
     apart = np.arange(len(xyz)) >= len(grid)
     share, around = np.where(apart, votes, 0.9), neighborhood(xyz, GeometrySettings())
-    kept = _without_islands(np.zeros(len(xyz), np.int32), share, np.ones(len(xyz)), around, least=0.1)
+    kept = _without_islands(np.zeros(len(xyz), np.int32), share, np.ones(len(xyz)), around, min_share=0.1)
     assert (kept[~apart] == 0).all()
     assert (kept[apart] == (0 if stays else UNOBSERVED)).all()

@@ -99,7 +99,7 @@ def test_colors_say_as_much_in_tiles(scene: Scene, photographs: int, monkeypatch
         return view_votes(table)
 
     monkeypatch.setattr(tiles, "view_votes", kept)
-    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)  # no point is left out
+    monkeypatch.setattr(tiles, "MIN_SPACING_PX", 1e-6)  # no point is left out
     fit(some, replace(SETTINGS, tile_points=len(scene.points)), progress=False)
     whole, in_tiles, by_geometry = prepare(some, SETTINGS).table, tables[-1], prepare(none, SETTINGS).table
     found, expected, without = (table.exposure.toarray() for table in (in_tiles, whole, by_geometry))

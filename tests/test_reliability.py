@@ -17,7 +17,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.labellers import grouping
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.reliability import SAME_LOOK, _cut, likely_cause, split_half
+from og_pointcloud.fitting.reliability import SAME_LOOK_COSINE, _cut, likely_cause, split_half
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import NOT_SEEN, Points, Scene
 from og_pointcloud.settings import FitSettings
@@ -72,7 +72,7 @@ def literally(scene: Scene):
     looks = [look(labelling.instances, k) for k in range(len(labelling.instances))]
 
     def alike(a, b):
-        return a == b or looks[a] @ looks[b] > SAME_LOOK
+        return a == b or looks[a] @ looks[b] > SAME_LOOK_COSINE
 
     def nearest(feature):
         return int(np.argmax([feature @ other for other in looks]))

@@ -15,9 +15,15 @@ from test_membership import decide
 
 from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.colors import DIFFERENCES, MOST, likelihood_ratios
+from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS, MAX_COLOR_RATIO, likelihood_ratios
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.seen_colors import NO_COLOR, believed, differences, doubted_by_color, sight_ratios
+from og_pointcloud.fitting.seen_colors import (
+    NO_DIFFERENCE,
+    differences,
+    doubted_by_color,
+    sight_ratios,
+    with_color_evidence,
+)
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Camera, Points, View
 
@@ -75,7 +81,7 @@ def test_differences_are_those_of_the_literal_reference(seed: int) -> None:
     expected = literal.compared_colors(CAMERA, view.image, points.xyz, points.rgb, NEAR, exposure)
     np.testing.assert_array_equal(found, expected[0])
     np.testing.assert_array_equal(counts, expected[1][[0, 1]])
-    assert 0 < (found == NO_COLOR).sum() < len(found)
+    assert 0 < (found == NO_DIFFERENCE).sum() < len(found)
     assert counts.sum(axis=1).min() > 50
 
 
@@ -84,10 +90,10 @@ def test_beliefs_are_those_of_bayes_rule(seed: int) -> None:
     random = np.random.default_rng(seed)
     exposure = csr_array((random.random((4, 30)) * (random.random((4, 30)) < 0.6)).astype(np.float32))
     before = exposure.data.copy()
-    difference = random.integers(0, NO_COLOR + 1, exposure.nnz).astype(np.uint16)
-    ratios = np.append(np.linspace(MOST, 1 / MOST, DIFFERENCES), 1).astype(np.float32)
+    difference = random.integers(0, NO_DIFFERENCE + 1, exposure.nnz).astype(np.uint16)
+    ratios = np.append(np.linspace(MAX_COLOR_RATIO, 1 / MAX_COLOR_RATIO, COLOR_DIFFERENCE_BINS), 1).astype(np.float32)
     table = replace(hand_table(30, [[(range(5), ONE)]] * 4), exposure=exposure)
-    found = believed(table, difference, ratios)
+    found = with_color_evidence(table, difference, ratios)
     expected = [literal.believed(open_, ratios[apart]) for open_, apart in zip(before, difference, strict=True)]
     np.testing.assert_allclose(found.exposure.data, expected, rtol=1e-5)
     # What masks have in common is told by geometry alone.
@@ -99,8 +105,8 @@ def test_what_came_through_holes_stays_beside_what_colors_doubt() -> None:
     holes = csr_array(np.where(np.arange(60) % 7 == 0, 0.5, 0).reshape(2, 30).astype(np.float32))
     table = replace(table, exposure=csr_array(np.full((2, 30), 0.4, np.float32)), doubted=holes)
     plain = table.with_doubted().exposure.toarray()
-    ratios = np.append(np.linspace(MOST, 1 / MOST, DIFFERENCES), 1).astype(np.float32)
-    found = believed(table, np.full(60, DIFFERENCES - 1, np.uint16), ratios)
+    ratios = np.append(np.linspace(MAX_COLOR_RATIO, 1 / MAX_COLOR_RATIO, COLOR_DIFFERENCE_BINS), 1).astype(np.float32)
+    found = with_color_evidence(table, np.full(60, COLOR_DIFFERENCE_BINS - 1, np.uint16), ratios)
     assert found.exposure.data.max() < 0.1
     np.testing.assert_allclose(found.with_doubted().exposure.toarray(), plain, rtol=1e-5)
 
@@ -169,18 +175,18 @@ def test_colors_that_say_nothing_change_nothing(kind: str) -> None:
 
 
 def test_ratios_have_one_for_no_color() -> None:
-    counts = np.zeros((2, DIFFERENCES))
+    counts = np.zeros((2, COLOR_DIFFERENCE_BINS))
     counts[0, :20], counts[1, 60:] = 5000, 500
     ratios = sight_ratios(counts)
-    assert ratios[NO_COLOR] == 1
-    assert ratios[0] == pytest.approx(MOST)
-    assert ratios[200] == pytest.approx(1 / MOST)
+    assert ratios[NO_DIFFERENCE] == 1
+    assert ratios[0] == pytest.approx(MAX_COLOR_RATIO)
+    assert ratios[200] == pytest.approx(1 / MAX_COLOR_RATIO)
 
 
 def test_few_cases_say_little() -> None:
     """Of colors that many points share, three more that are hidden: by themselves they would say all that is said."""
-    counts = np.zeros((2, DIFFERENCES))
+    counts = np.zeros((2, COLOR_DIFFERENCE_BINS))
     counts[0, 0], counts[1, 1] = 3, 3
     few, many = likelihood_ratios(*counts), likelihood_ratios(*(1000 * counts))
     assert 1 < few[0] < 1.3
-    assert many[0] == pytest.approx(MOST)
+    assert many[0] == pytest.approx(MAX_COLOR_RATIO)

@@ -90,7 +90,7 @@ def test_coincident_points_stay_together():
 
 @pytest.mark.slow
 def test_one_tile_is_the_fit_itself(monkeypatch):
-    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
+    monkeypatch.setattr(tiles, "MIN_SPACING_PX", 1e-6)
     cloud = fit(street().scene, replace(SETTINGS, tile_points=POINTS), progress=False)
     assert len(whole().instances) > 20
     np.testing.assert_array_equal(cloud.instance_ids, whole().instance_ids)
@@ -205,8 +205,8 @@ def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     return cloud
 
 
-def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
-    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
+def test_every_point_that_shows_is_points_to_draw(monkeypatch, tmp_path):
+    monkeypatch.setattr(tiles, "MIN_SPACING_PX", 1e-6)
     random = np.random.default_rng(3)
     points = Points((4 * random.normal(size=(4000, 3))).astype(np.float32), np.zeros(3))
     camera = Camera(40, 30, 25.0, 40.0, 3.0, 28.0, np.eye(4))
@@ -216,7 +216,7 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
     # So faint that nothing hides anything.
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32), 0.01)
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._points_to_draw(view, cloud, drawing)
     assert len(shows) > 250
     assert set(shows) <= set(rows)
     assert len(rows) == inside < 2000
@@ -224,23 +224,23 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
 
 
 def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch, tmp_path):
-    monkeypatch.setattr(tiles, "FINEST_PX", 0.5)
+    monkeypatch.setattr(tiles, "MIN_SPACING_PX", 0.5)
     random = np.random.default_rng(4)
     xyz = np.concatenate([random.uniform(-1, 1, (40_000, 2)), np.full((40_000, 1), 4.0)], axis=1).astype(np.float32)
     camera = Camera(80, 80, 160.0, 160.0, 40.0, 40.0, np.eye(4))
     view = View("view", camera, np.full((80, 80), -1, np.int32), np.zeros((0, 4), np.float32))
     cloud = tiled_cloud(
         Points(xyz, np.zeros(3)), 0.00625, WorkFolder(tmp_path)
-    )  # a quarter of a pixel, half of FINEST_PX
+    )  # a quarter of a pixel, half of MIN_SPACING_PX
     drawing = tiles._Drawing(0.5, 0.1, 0.00625)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._points_to_draw(view, cloud, drawing)
     assert inside == 40_000
     assert len(rows) == pytest.approx(10_000, rel=0.05)
     np.testing.assert_allclose(larger, 2, rtol=1e-3)
-    others, _, _ = tiles._worth_drawing(replace(view, name="other"), cloud, drawing)
+    others, _, _ = tiles._points_to_draw(replace(view, name="other"), cloud, drawing)
     assert len(np.intersect1d(rows, others)) == pytest.approx(2_500, rel=0.1)
-    monkeypatch.setattr(tiles, "MOST_SPLATS", 3_000)
-    rows, larger, _ = tiles._worth_drawing(view, cloud, drawing)
+    monkeypatch.setattr(tiles, "MAX_SPLATS", 3_000)
+    rows, larger, _ = tiles._points_to_draw(view, cloud, drawing)
     assert 2_000 < len(rows) < 3_200
     assert (larger**2).sum() == pytest.approx(40_000, rel=0.05)
 
@@ -330,7 +330,7 @@ def test_masks_that_the_sample_misses_give_no_instance(monkeypatch):
 def test_a_fit_is_in_tiles_where_memory_is_short_and_they_help(monkeypatch):
     scene, tight = two_walls(), FitSettings(memory=64_000_000)
     assert not tiles.needs_tiles(scene, tight)  # no larger than the smallest tile
-    monkeypatch.setattr(tiles, "LEAST_TILE", 1000)
+    monkeypatch.setattr(tiles, "MIN_TILE_POINTS", 1000)
     assert not tiles.needs_tiles(scene, FitSettings())
     assert not tiles.needs_tiles(scene, replace(tight, mode="paper"))
     assert tiles.needs_tiles(scene, tight)

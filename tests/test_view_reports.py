@@ -17,8 +17,8 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting import view_votes as votes_module
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import Membership, assign_points, settled_points
-from og_pointcloud.fitting.view_reports import EXPECTED, LEAST
+from og_pointcloud.fitting.membership import Membership, assign_and_mark_spanning, assign_points
+from og_pointcloud.fitting.view_reports import MIN_REPORT_PROBABILITY, PRIOR_COUNT
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings
@@ -56,7 +56,7 @@ def test_masks_that_swallow_a_thing_tell_of_neither_once_points_have_chosen() ->
     table = hand_table(N, [KNOWS] * 2 + [both] * 3)
     before = MaskGroups(np.array([0, 1, 0, 1, 0, 0, 1], np.int32), 2, np.zeros(7, bool))
     around, settings = neighborhood(on_a_line(N), GeometrySettings()), FitSettings()
-    known, found = settled_points(table, view_votes(table), before, around, settings)
+    known, found = assign_and_mark_spanning(table, view_votes(table), before, around, settings)
     assert known.spanning.tolist() == [False] * 4 + [True] * 3
     assert known.group.tolist() == before.group.tolist()
     assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
@@ -66,7 +66,7 @@ def test_masks_that_swallow_a_thing_tell_of_neither_once_points_have_chosen() ->
 def test_where_no_mask_spans_two_things_points_choose_once() -> None:
     table = hand_table(N, [KNOWS] * 3)
     before, around = groups([0, 1] * 3), neighborhood(on_a_line(N), GeometrySettings())
-    known, found = settled_points(table, view_votes(table), before, around, FitSettings())
+    known, found = assign_and_mark_spanning(table, view_votes(table), before, around, FitSettings())
     assert known is before
     assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
 
@@ -75,17 +75,17 @@ def test_what_views_report_is_counted_on_clear_points() -> None:
     """One view calls the whole book shelf, and has a mask of nothing else; it sees what is beside both, too."""
     table = hand_table(N + 40, [KNOWS] * 3 + [[(range(N), ONE)]])
     reports = decide(table, [0, 1] * 3 + [0]).scene.reports
-    assert reports.column.tolist() == [[0, 1, 2]] * 3 + [[0, -1, 1]]
-    first = reports.first[3]
-    shelf, book, background = reports.chance[first : reports.first[4]].reshape(3, 2)
+    assert reports.report_column.tolist() == [[0, 1, 2]] * 3 + [[0, -1, 1]]
+    first = reports.table_start[3]
+    shelf, book, background = reports.probability[first : reports.table_start[4]].reshape(3, 2)
 
     def chance(counted: float, total: float) -> float:
-        return LEAST + (1 - LEAST) * counted / (total + EXPECTED)
+        return MIN_REPORT_PROBABILITY + (1 - MIN_REPORT_PROBABILITY) * counted / (total + PRIOR_COUNT)
 
     # The points are all but certain: as if counted on them.
-    np.testing.assert_allclose(shelf, [chance(40 + EXPECTED, 40), LEAST], atol=0.02)
-    np.testing.assert_allclose(book, [chance(20, 20), chance(EXPECTED, 20)], atol=0.02)
-    np.testing.assert_allclose(background, [LEAST, chance(40 + EXPECTED, 40)], atol=0.02)
+    np.testing.assert_allclose(shelf, [chance(40 + PRIOR_COUNT, 40), MIN_REPORT_PROBABILITY], atol=0.02)
+    np.testing.assert_allclose(book, [chance(20, 20), chance(PRIOR_COUNT, 20)], atol=0.02)
+    np.testing.assert_allclose(background, [MIN_REPORT_PROBABILITY, chance(40 + PRIOR_COUNT, 40)], atol=0.02)
 
 
 def test_points_that_adjoin_an_instance_may_be_of_it_though_no_mask_of_it_holds_them() -> None:
@@ -145,7 +145,7 @@ def test_a_part_of_a_scene_is_decided_as_within_it() -> None:
 def test_a_thing_too_small_for_the_sample_that_reports_were_counted_on_is_found() -> None:
     table = hand_table(N, [[(range(30), ONE), (range(50, 55), OTHER)]] * 4)
     sample = told(table, [0, 1] * 4, slice(50))
-    assert (sample.scene.reports.column[:, 1] == -1).all()
+    assert (sample.scene.reports.report_column[:, 1] == -1).all()
     found = told(table, [0, 1] * 4, whole=sample).instance_ids
     assert found.tolist() == [0] * 30 + [BACKGROUND] * 20 + [1] * 5 + [BACKGROUND] * 5
 

@@ -45,13 +45,13 @@ def fit(
     A cloud that would not fit into memory as a whole is fitted in tiles (tiles.py); `FitSettings.memory` and
     `FitSettings.tile_points` decide.
 
-    work: a folder in which the views of a long fit, and the training of mode "paper", are kept, so that the next call
-    goes on where this one was interrupted or killed; its files are removed at the end. None: nothing is kept.
+    work: a folder that keeps the views of a long fit, and the training of mode "paper", so that the next call resumes
+    where this one was interrupted or killed; its files are removed at the end. None: nothing is kept.
     executor: of `concurrent.futures`, takes the tiles and views of a fit in tiles as tasks. Its workers must see the
     work folder (without one, the folder for temporary files) by the same path. The result is the same, bit for bit.
     progress: show bars on a terminal.
 
-    The capture is checked first, and the answer last (og_pointcloud.checking). A `CaptureWarning` says what does not
+    The capture is checked first, and the result last (og_pointcloud.checking). A `CaptureWarning` says what does not
     fit together; provenance["checks"] has every check. They change no label.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
@@ -80,7 +80,7 @@ def fit(
     with journal.stage("checks"):
         checks = check_capture(scene)
     warn_of_doubts(checks)
-    # The folder's files are removed once the cloud is made: only a run that ends before leaves them.
+    # The folder's files are removed once the cloud is made: only a run that ends earlier leaves them.
     with WorkFolder.open(work) as kept:
         if needs_tiles(scene, settings):
             _check(scene, journal)
@@ -97,11 +97,11 @@ def fit(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What the stages before labelling found; all modes but "paper", which draws points differently, share it.
+    """Results of the stages before labelling, shared by all modes but "paper", which draws points differently.
 
-    scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface,
-    without what lies behind a mask's object (see_through.py). Views cut from one photograph are one
-    view of the table, except in mode "paper".
+    scene: as given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface, without
+    what lies behind a mask's object (see_through.py). Views cut from one photograph are one view of the table, except
+    in mode "paper".
     """
 
     scene: Scene
@@ -130,9 +130,9 @@ def fit_prepared(
     journal: Journal | None = None,
     work: WorkFolder | None = None,
 ) -> LabelledCloud:
-    """The stages of `fit` from the mask table on. Settings of earlier stages are those that it was prepared with.
+    """The stages of `fit` from the mask table on. Settings of earlier stages stay as it was prepared with.
 
-    work: keeps the training of mode "paper", which is the one labeller that takes hours; None: nothing is kept.
+    work: keeps the training of mode "paper", the only labeller that takes hours; None: nothing is kept.
     """
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
@@ -142,7 +142,7 @@ def fit_prepared(
 
 
 def labelled_cloud(prepared: Prepared, labelling: Labelling, settings: FitSettings, journal: Journal) -> LabelledCloud:
-    """The scene's points with a labelling of the surface's."""
+    """The scene's points with the labels of the surface's points."""
     spacing = float(np.median(prepared.surface.neighborhood.spacing))
     # Points at the same place were left out of the surface, and get the same label.
     labelling = labelling.of_points(prepared.surface.row_of_point)
@@ -150,7 +150,7 @@ def labelled_cloud(prepared: Prepared, labelling: Labelling, settings: FitSettin
 
 
 def _with_reliability(labelling: Labelling, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
-    """The labelling with the reliability of each instance; a warning where the scene's is low."""
+    """The labelling with the reliability of each instance; a warning if the scene's is low."""
     with journal.stage("reliability"):
         found = split_half(prepared.table, prepared.surface, labelling, settings)
     if found is None:
@@ -188,11 +188,11 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
 
 
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:
-    """The mask table of a surface, without what its masks show behind their objects. The table, and the views that are
-    worked on side by side, each keep to their share of the memory."""
+    """The mask table of a surface, without what its masks show behind their objects. The table, and the views rendered
+    at the same time, each stay within their share of the memory."""
     visibility, views = settings.visibility, surface.scene.views
     with journal.stage("visibility"):
-        # As many views at once as fit into their share, one at least; the table gets its share of what they leave.
+        # As many views at once as fit into their share, at least one; the table gets its share of the rest.
         left = memory_left(settings.memory)
         largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
         one_view = working_memory(len(surface.gaussians), largest)
@@ -215,7 +215,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             "on_disk": in_file(table.exposure.data),
             "views_side_by_side": at_once,
         }
-        if work.found:  # views that an interrupted fit left
+        if work.found:  # views of an interrupted fit
             journal.leave_out(
                 LeftOut.RENDERING, count=work.found, folder="" if work.folder is None else work.folder.name
             )
@@ -223,7 +223,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
         # Areas were counted in pixels of the thinned images.
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
         table = front_surfaces(surface, table, settings, journal)
-        if settings.mode == "paper":  # which draws views again, and asks for the masks of each
+        if settings.mode == "paper":  # renders views again, and needs the masks of each
             return table
         table = doubted_by_color(table, surface.scene.points, views, surface.near, journal)
         return Photographs.of(views).joined(table)
@@ -233,7 +233,7 @@ def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, jo
     """The table without what its masks show behind their objects (`without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
     poses = np.stack([camera.world_to_camera for camera in cameras])
-    # Of the full images, as the masks' areas are by now.
+    # For the full images, like the masks' areas by now.
     focal = np.sqrt([camera.fx * camera.fy for camera in cameras])
     table, share = without_see_through(table, surface.gaussians, poses, focal, settings.membership)
     journal.notes["seen_through"] = round(share, 5)
@@ -243,7 +243,7 @@ def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, jo
 def _cloud_of(
     scene: Scene, labelling: Labelling, spacing: float, settings: FitSettings, journal: Journal
 ) -> LabelledCloud:
-    """The scene's points with their labels, and how they came about; a warning where there is no instance."""
+    """The scene's points with their labels and provenance; a warning if there is no instance."""
     ids, certainty = labelling.instance_ids, labelling.certainty
     states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}

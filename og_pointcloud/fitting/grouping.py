@@ -1,19 +1,18 @@
 """Masks of different views -> instances, without training: masks are one object where most views say so.
 
-Two masks of two views show the same thing as far as they share Gaussians that both views see. Let
+Two masks of two views show the same thing to the extent that they share Gaussians that both views see. Let
 
     N_ij = sum_g A_ig A_jg            mass that mask i and mask j share
     N_ib = sum_g A_ig s_bg            mass of mask i that view b sees at all (s = masked + unmasked weight)
 
-so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. From it follows, per mask and view, its
-*container*: the one mask of that view holding most of it, if there is one. Each view is thus a witness for every pair
+so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. This gives, for each mask and view, the
+mask's *container*: the one mask of that view that holds most of it, if any. Each view is thus a witness for every pair
 of masks that have containers in it: "one thing" (the same container) or "two" (different ones). A view that sees both
-and has a mask of one alone says "two" with half a voice: proposers miss whole things, but sometimes parts of them. A
-view that missed both says nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups
-says "one thing": a mask that spans two objects is outvoted, parts of one object come together when other views show it
-whole.
+but has a mask of only one says "two" with half weight: proposers mostly miss whole things, but sometimes parts. A view
+that missed both says nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says
+"one thing": a mask that spans two objects is outvoted; parts of one object are joined when other views show it whole.
 
-Where masks have tracks, the tracker is one witness more. It says "one thing" of two masks with the same track, also of
+Where masks have tracks, the tracker is one more witness. It says "one thing" of two masks with the same track, even of
 the front and the back of a thing, which no view sees together, and "two" where their tracks were in one image. About
 other pairs it says nothing: what was out of sight comes back with another number.
 
@@ -43,23 +42,22 @@ UNKNOWN_LIKENESS = 0.5
 class MaskGroups:
     """group: (masks,) int32, the group of each mask, -1 where the mask was left out (it spans objects, or shows
     nothing). count: number of groups. spanning: (masks,) bool, masks that most views show as several things, and those
-    of `with_spanning`, which keep their group: they are named as it is."""
+    that `with_spanning` marks, which keep their group and describe it."""
 
     group: NDArray[np.int32]
     count: int
     spanning: NDArray[np.bool_]
 
     @property
-    def told(self) -> NDArray[np.int32]:
-        """(masks,) int32, the group that each mask tells points to be of, -1 none: spanning masks tell of no single
-        one."""
+    def voting_group(self) -> NDArray[np.int32]:
+        """(masks,) int32, the group that each mask votes for, -1 none: spanning masks vote for no single group."""
         return np.where(self.spanning, -1, self.group).astype(np.int32)
 
 
 def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np.int64] | None = None) -> MaskGroups:
-    """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance.
+    """Group the masks of a table. Group numbers are ordered by shown mass, largest first, and deterministic.
 
-    sample: the columns that overlaps are measured on; means over thousands of points need no more. None: all.
+    sample: the columns that overlaps are measured on; thousands of points are enough for their means. None: all.
     """
     share, left_out = mask_shares(table if sample is None else table.of_points(sample), settings)
     spanning = _spanning_masks(share, table.mask_view, settings)
@@ -78,37 +76,37 @@ def with_spanning(
     ids: NDArray[np.int32],
     settings: GroupingSettings,
 ) -> MaskGroups:
-    """The groups, masks that span two of them marked: where a proposer misses a cup, its table's mask may hold it.
+    """The groups, with masks marked that span two of them: where a proposer misses a cup, its table's mask may hold it.
 
-    A mask spans two groups if it holds most of what its view shows of either, and either is a good part of it. ids:
-    (n,) int32, the group that each point is of as far as views tell, below 0 none.
+    A mask spans two groups if it holds most of what its view shows of each, and each is a good part of the mask. ids:
+    (n,) int32, the group of each point as decided so far, below 0 none.
     """
     of_group = indicator(ids, groups.count).T
     held = (votes.in_mask @ of_group).toarray()  # (masks, groups)
     shown = (votes.vote @ of_group).toarray()[mask_view]
-    whole = np.asarray(votes.in_mask.sum(axis=1), np.float64).reshape(-1, 1)
-    has = (held > settings.container_share * shown) & (held > settings.spanning_share * whole)
-    return replace(groups, spanning=groups.spanning | ((has.sum(axis=1) > 1) & (groups.group >= 0)))
+    total = np.asarray(votes.in_mask.sum(axis=1), np.float64).reshape(-1, 1)
+    spans = (held > settings.container_share * shown) & (held > settings.spanning_share * total)
+    return replace(groups, spanning=groups.spanning | ((spans.sum(axis=1) > 1) & (groups.group >= 0)))
 
 
 def mask_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, NDArray[np.bool_]]:
     """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j. And
-    (masks, views): whether a view sees what a mask shows, most of it outside of its own masks.
+    (masks, views): whether a view sees what a mask shows, most of it outside the view's own masks.
 
-    Holes and colors take nothing from these votes: what shows through a plant's leaves is in its masks alike, and says
-    as well as the leaves do how far two masks hold the same.
+    These votes ignore holes and colors: what shows through a plant's leaves lies in its masks too, and is as good a
+    measure of their overlap as the leaves.
     """
     votes = view_votes(table.with_doubted())
     weights, seen = votes.in_mask, votes.vote
-    together = (weights @ weights.T).tocoo()  # N_ij
+    shared = (weights @ weights.T).tocoo()  # N_ij
     visible = (weights @ seen.T).toarray()  # N_ib
-    own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
-    rows, cols = together.row, together.col
+    mask_mass = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
+    rows, cols = shared.row, shared.col
     base = visible[rows, table.mask_view[cols]]
-    # A view that sees only a sliver of a mask is no witness of it.
-    sees = visible > settings.witness_share * own[:, None]
-    enough = sees[rows, table.mask_view[cols]]
-    share = csr_array((together.data[enough] / base[enough], (rows[enough], cols[enough])), shape=together.shape)
+    # A view that sees only a sliver of a mask is no witness for it.
+    sees = visible > settings.witness_share * mask_mass[:, None]
+    kept = sees[rows, table.mask_view[cols]]
+    share = csr_array((shared.data[kept] / base[kept], (rows[kept], cols[kept])), shape=shared.shape)
     in_masks = (share @ indicator(table.mask_view, visible.shape[1]).T).toarray()
     return share, sees & (in_masks < 1 - settings.container_share)
 
@@ -122,7 +120,7 @@ def indicator(owner: NDArray[np.int32], count: int) -> csr_array:
 def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: GroupingSettings) -> NDArray[np.bool_]:
     """Masks that most of the witnessing views show as two things or more.
 
-    A view shows mask i as several when no mask of it holds i, while two or more of its masks that lie within i do
+    A view shows mask i as several things when none of its masks holds i, but two or more of its masks lie within i and
     together cover it.
     """
     entries = share.tocoo()
@@ -163,8 +161,8 @@ def _containers(
     entries = share.tocoo()
     holds = (entries.data > settings.container_share) & ~spanning[entries.col]
     rows, cols, value = entries.row[holds], entries.col[holds], entries.data[holds]
-    # More than half of a mask lies in at most one mask of a view, so a container is unique wherever there is one
-    # level of masks; overlapping levels keep the tightest by order of value.
+    # At most one mask of a view can hold more than half of a mask, so the container is unique with one level of masks;
+    # of overlapping levels the one that holds most is kept.
     order = np.lexsort((cols, -value, mask_view[cols], rows))
     rows, cols = rows[order], cols[order]
     first = np.ones(len(rows), bool)
@@ -175,21 +173,21 @@ def _containers(
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """What views, and the tracker, say of pairs of masks.
+    """What views, and the tracker, say about pairs of masks.
 
-    rows, cols: the pairs that any of them shows as one thing, both ways, rows ascending. one: how many say so.
+    rows, cols: the pairs that any witness shows as one thing, both ways, rows ascending. agree: how many say so.
     same_extent: how many of these count whatever the features say: all if the two masks have the same extent, else the
-    tracker alone. speaks, hears: (masks, ...); speaks[i] @ hears[j] is how many witnesses say anything of a pair: views
-    in which both have a container, or one does and the other is left out; and the tracker where both tracks are the
-    same or were in one image.
+    tracker alone. left, right: (masks, ...); left[i] @ right[j] is the number of witnesses for the pair (i, j): views
+    in which both have a container, or one has and the other is left out; and the tracker where both tracks are the same
+    or were in one image.
     """
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]
-    one: NDArray[np.float64]
+    agree: NDArray[np.float64]
     same_extent: NDArray[np.float64]
-    speaks: NDArray[np.float64]
-    hears: NDArray[np.float64]
+    left: NDArray[np.float64]
+    right: NDArray[np.float64]
 
 
 def _witnesses(
@@ -202,25 +200,25 @@ def _witnesses(
     views = left_out.shape[1]
     held = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
     # (h + l)(h' + l') - l l' is hh' + hl' + lh': views that hold both, or hold one and leave out the other.
-    left = settings.left_out_voice * left_out.astype(np.float64)
-    speaks, hears = np.column_stack([held + left, left]), np.column_stack([held + left, -left])
-    followed = indicator(np.full(len(held), -1, np.int32), len(held))  # no pair
+    absent = settings.left_out_voice * left_out.astype(np.float64)
+    left, right = np.column_stack([held + absent, absent]), np.column_stack([held + absent, -absent])
+    tracked = indicator(np.full(len(held), -1, np.int32), len(held))  # no pair
     if table.mask_track is not None:
         # Tracks as 0, 1, ..., -1 none: np.unique counts -1 as a value, the subtraction takes it away again.
         track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
         tracks = indicator(track.astype(np.int32), int(track.max(initial=-1)) + 1)
-        followed = csr_array(tracks.T @ tracks)
+        tracked = csr_array(tracks.T @ tracks)
         in_view = tracks @ indicator(table.mask_view, views).T
         together = (in_view @ in_view.T).toarray() > 0  # tracks in one image, each with itself too
-        # A mask speaks in the column of its track, and hears in those of all tracks that were in an image with it.
-        speaks, hears = np.column_stack([speaks, tracks.T.toarray()]), np.column_stack([hears, tracks.T @ together])
-    pairs = csr_array(container @ container.T + followed).tocoo()
+        # On the left a mask has its own track's column, on the right those of all tracks that were in an image with it.
+        left, right = np.column_stack([left, tracks.T.toarray()]), np.column_stack([right, tracks.T @ together])
+    pairs = csr_array(container @ container.T + tracked).tocoo()
     off_diagonal = pairs.row != pairs.col
-    rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
-    # Of the same extent: either lies mostly in the other.
+    rows, cols, agree = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
+    # The same extent: each lies mostly in the other.
     smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
-    sure = np.where(smaller > settings.container_share, one, _lookup(followed, rows, cols))
-    return _Witnesses(rows, cols, one, sure, speaks, hears)
+    certain = np.where(smaller > settings.container_share, agree, _lookup(tracked, rows, cols))
+    return _Witnesses(rows, cols, agree, certain, left, right)
 
 
 def _agglomerate(
@@ -233,24 +231,24 @@ def _agglomerate(
     """Join the pair of groups with the most agreement until no majority is left; a group number per mask, -1 unused.
 
     The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
-    are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
-    a table whose view missed the cup: then the witnesses count as far as the features are alike.
-    Of pairs with the same agreement the one with more witnesses comes first, then the one with more similar features:
-    the order of views and masks does not matter.
+    are one thing whatever their features say. A mask that only lies within another may be a part of it, or a cup on a
+    table in a view that missed the cup: its witnesses are weighted by the likeness of the features.
+    Of pairs with equal agreement the one with more witnesses comes first, then the one with more similar features: the
+    order of views and masks does not matter.
     """
-    # A group's number is that of its lowest mask. Of features the sum and the number are kept, for means over pairs.
-    w, everyone = witnesses, np.arange(len(usable) + 1)
+    # A group's number is that of its lowest mask. Sums and numbers of features are kept, for means over pairs.
+    w, numbers = witnesses, np.arange(len(usable) + 1)
     kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
-    links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
-    group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
-    said = w.speaks.copy(), w.hears.copy(), total, features.any(axis=1).astype(np.float64)
-    _join(group, links, said, cosines_of_different(features, mask_view), settings.join_majority)
+    links = np.searchsorted(w.rows[kept], numbers), w.cols[kept].astype(np.int64), w.agree[kept], w.same_extent[kept]
+    group, total = np.where(usable, numbers[:-1], -1), features.astype(np.float64)
+    sums = w.left.copy(), w.right.copy(), total, features.any(axis=1).astype(np.float64)
+    _merge_groups(group, links, sums, cosines_within_views(features, mask_view), settings.join_majority)
     return _roots(group)
 
 
-def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Cosines of the features of two masks of one view, ascending. These are mostly different things, whatever the
-    encoder: they calibrate its cosines."""
+def cosines_within_views(features: NDArray[np.floating], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Cosines of the features of two masks of the same view, ascending. Such masks mostly show different things, which
+    calibrates the cosines of any encoder."""
     cosines = [np.zeros(0)]
     for view in np.unique(mask_view):
         rows = features[mask_view == view][:200]  # 20,000 pairs of a view are enough
@@ -259,60 +257,60 @@ def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.i
 
 
 @njit(cache=True)
-def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
-    """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
+def _merge_groups(group, links, sums, different, majority):  # noqa: ANN001, ANN202
+    """Writes to ``group``, at first each mask's own number or -1, the lower number that it was joined with.
 
-    links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, how many) of
-    each mask; here they become the sums of groups. different: as of `cosines_of_different`.
+    links: sparse rows of masks: (start, other masks, agree, same extent). sums: (left, right, features, number of
+    features) of each mask; here they become the sums of groups. different: `cosines_within_views`.
     """
-    start, others, one, same_extent = links
-    speaks, hears, features, described = said
+    start, others, agree, same_extent = links
+    left, right, features, described = sums
     rows = [slice(start[a], start[a + 1]) for a in range(len(group))]
-    linked = [(others[row], one[row], same_extent[row]) for row in rows]
+    links_of = [(others[row], agree[row], same_extent[row]) for row in rows]
     version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
-    # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then. (An
-    # empty list of a known type, which numba needs.)
+    # Pairs of groups, the best on top: minus agreement, witnesses and cosine; the two groups and their versions when
+    # pushed. (An empty list of a known type, which numba needs.)
     heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
     for a in range(len(group)):
-        _offer(heap, a, a, linked[a], said, version, different, majority)
+        _push_pairs(heap, a, a, links_of[a], sums, version, different, majority)
     while len(heap):
         _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
-        # Stale: one of the two has grown or joined another since it was offered; what it is now was offered anew.
+        # Stale: one of the two has grown or joined another since it was pushed; its present pairs were pushed then.
         if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
             continue
-        # The higher number joins the lower one, which takes on all that either says.
+        # The higher number joins the lower one, which takes on the sums of both.
         group[b] = a
         version[a] += 1
-        speaks[a] += speaks[b]
-        hears[a] += hears[b]
+        left[a] += left[b]
+        right[a] += right[b]
         features[a] += features[b]
         described[a] += described[b]
-        linked[a] = _pooled(linked[a], linked[b], a, group, place)
-        linked[b] = others[:0], one[:0], same_extent[:0]
-        _offer(heap, a, -1, linked[a], said, version, different, majority)
+        links_of[a] = _merged_links(links_of[a], links_of[b], a, group, place)
+        links_of[b] = others[:0], agree[:0], same_extent[:0]
+        _push_pairs(heap, a, -1, links_of[a], sums, version, different, majority)
 
 
 @njit(cache=True)
-def _offer(heap, a, above, links, said, version, different, majority):  # noqa: ANN001, ANN202
-    """Puts on the heap the pairs of group a and those linked to it, of numbers above one, that most witnesses join."""
-    speaks, hears, features, described = said
-    for b, one, same_extent in zip(*links):  # noqa: B905
-        asked = np.dot(speaks[b], hears[a])
-        if b <= above or one / asked <= majority:  # features only ever take agreement away
+def _push_pairs(heap, a, above, links, sums, version, different, majority):  # noqa: ANN001, ANN202
+    """Pushes the pairs of group a and each linked group numbered above ``above`` that a majority of witnesses joins."""
+    left, right, features, described = sums
+    for b, agree, same_extent in zip(*links):  # noqa: B905
+        witnesses = np.dot(left[b], right[a])
+        if b <= above or agree / witnesses <= majority:  # features only ever take agreement away
             continue
-        # The mean over pairs of masks, as ``different`` is of pairs: sums have less noise, and any two are more alike.
+        # The mean over pairs of masks, comparable with ``different``: sums have less noise, so any two are more alike.
         pairs = described[a] * described[b]
         cosine = np.dot(features[a], features[b]) / pairs if pairs > 0 else 0.0
-        alike = _likeness(cosine, different) if pairs > 0 else UNKNOWN_LIKENESS
-        agreement = (same_extent + (one - same_extent) * alike) / asked
+        likeness = _likeness(cosine, different) if pairs > 0 else UNKNOWN_LIKENESS
+        agreement = (same_extent + (agree - same_extent) * likeness) / witnesses
         if agreement > majority:
             low, high = min(a, b), max(a, b)
-            heapq.heappush(heap, (-agreement, -asked, -cosine, low, high, version[low], version[high]))
+            heapq.heappush(heap, (-agreement, -witnesses, -cosine, low, high, version[low], version[high]))
 
 
 @njit(cache=True)
 def _likeness(cosine, different):  # noqa: ANN001, ANN202
-    """The share of different things that are less alike."""
+    """The share of different things that are less alike than this."""
     if not len(different):
         return UNKNOWN_LIKENESS
     # The mean of the ranks with and without equal ones; cosines within rounding are equal.
@@ -321,26 +319,24 @@ def _likeness(cosine, different):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _pooled(first, second, a, group, place):  # noqa: ANN001, ANN202
-    """The links of group a, of those that both parts of it had before, each other group once.
-
-    place: (masks,) all -1, and so again in the end.
-    """
-    most = len(first[0]) + len(second[0])
-    others, one, same_extent = np.empty(most, np.int64), np.zeros(most), np.zeros(most)
+def _merged_links(first, second, a, group, place):  # noqa: ANN001, ANN202
+    """The links of group a, summed over its two parts, each other group once. place: (masks,) all -1, before and
+    after."""
+    capacity = len(first[0]) + len(second[0])
+    others, agree, same_extent = np.empty(capacity, np.int64), np.zeros(capacity), np.zeros(capacity)
     count = 0
     for links in (first, second):
-        for b, of_one, of_same_extent in zip(*links):  # noqa: B905
-            while group[b] != b:  # which joined another since
+        for b, b_agree, b_same_extent in zip(*links):  # noqa: B905
+            while group[b] != b:  # has joined another since
                 b = group[b]
             if b == a:
                 continue
             if place[b] < 0:
                 place[b], others[count], count = count, b, count + 1
-            one[place[b]] += of_one
-            same_extent[place[b]] += of_same_extent
+            agree[place[b]] += b_agree
+            same_extent[place[b]] += b_same_extent
     place[others[:count]] = -1
-    return others[:count], one[:count], same_extent[:count]
+    return others[:count], agree[:count], same_extent[:count]
 
 
 def _roots(group: NDArray[np.int64]) -> NDArray[np.int64]:

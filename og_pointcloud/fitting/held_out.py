@@ -1,12 +1,12 @@
-"""How large a point is drawn, decided by views that were held out: no truth, no photograph, no threshold is needed.
+"""How large points are drawn, decided on held-out views: no ground truth, photograph or threshold is needed.
 
-Too large, and points hide what lies behind their edge; too small, and rays slip through a surface and label what is
-behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are made from every
-other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
-those views show depends on the size too, so the labels of each size are judged with points of each of the settings'
-sizes, and the best on average is taken. (Judged with their own size alone, large opaque points would always agree with
-themselves best.) A cloud of many noisy layers may want far smaller points than most: where the smallest is clearly the
-best, or the largest, the search goes on beyond.
+Points that are too large hide what lies behind their edges; if they are too small, rays slip through a surface and
+label what is behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are
+made from every other view, with points of each size, and judged by how well they reproduce the masks of the views
+between. What those views show depends on the size too, so the labels of each size are judged with points of all sizes
+in the settings, and the best on average is taken. (Judged with their own size alone, large opaque points would always
+agree with themselves best.) A cloud of many noisy layers may need far smaller points than most: where the smallest or
+the largest size is clearly the best, the search goes on beyond it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from og_pointcloud.rendering.geometry import Neighborhood, isotropic, neighborho
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
-MAPS_SHARE = 0.05
-"""Of the memory that a fit has left, mask maps may take so much: then they are read once, not for each size anew."""
-FEWEST_VIEWS = 8
-"""Views needed: with fewer, the labels of a half are so poor that choosing by them is no better than the middle."""
-STEP = 1.4
-"""From a size to the next one beyond the settings' own, which are as far apart."""
-CLEARLY = 0.005
+MASK_MAPS_MEMORY_SHARE = 0.05
+"""Mask maps that take less than this share of a fit's remaining memory are read once, not again for each size."""
+MIN_VIEWS = 8
+"""With fewer views, the labels of a half are so poor that choosing by them is no better than the middle size."""
+SCALE_STEP = 1.4
+"""Factor from a size to the next one beyond the settings' own, which are about as far apart."""
+MIN_AGREEMENT_GAIN = 0.005
 """By how much a size must agree better than the others before one beyond it is tried, and that one before it is taken:
 sizes that label alike differ by less, by chance."""
 
 
 @dataclass(frozen=True)
 class ScaleChoice:
-    """scale: standard deviation of the points' Gaussians, in spacings. agreements: of each scale tried, how well labels
-    made with it reproduce masks of held-out views, in [0, 1]; empty where views could not be held out."""
+    """scale: standard deviation of the points' Gaussians, in spacings. agreements: for each scale tried, how well its
+    labels reproduce the masks of held-out views, in [0, 1]; empty where views could not be held out."""
 
     scale: float
     agreements: dict[float, float]
@@ -56,12 +56,11 @@ def choose_scale(
     settings: FitSettings,
     journal: Journal,
 ) -> ScaleChoice:
-    """The scale whose labels of half of the views reproduce the masks of the other half best: of the settings' own, and
-    of smaller or larger ones while these are clearly better.
+    """The scale whose labels, made from half of the views, best reproduce the masks of the other half: of the settings'
+    own scales, and of smaller or larger ones while these are clearly better.
 
     spacing: (n,) that points are drawn by. thickness: (n,) of their surfaces. near: depth of the near plane. Only some
-    views and points are asked (see settings), but all points hide others. Does not depend on the order of views or
-    points.
+    views and points are used (see settings), but all points occlude. The order of views and points does not matter.
     """
     geometry = settings.geometry
     if len(geometry.scales) == 1:
@@ -70,29 +69,29 @@ def choose_scale(
     masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)
     spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
     chosen = [masked[index] for index in np.unique(spread)]
-    if len(chosen) < FEWEST_VIEWS:
+    if len(chosen) < MIN_VIEWS:
         return ScaleChoice(geometry.middle_scale, {})
     size = sum(4 * view.camera.width * view.camera.height for view in chosen)
-    if size < MAPS_SHARE * memory_left(settings.memory):
+    if size < MASK_MAPS_MEMORY_SHARE * memory_left(settings.memory):
         chosen = [replace(view, masks=view.mask_map()) for view in chosen]
     # Neighbors are looked up within the sample, as the labels below are of the sample alone.
     sample = sample_of_points(points.xyz, geometry.held_out_points)
     around = neighborhood(points.xyz[sample], geometry)
-    asked = np.zeros(len(points), np.bool_)
-    asked[sample] = True
+    selected = np.zeros(len(points), np.bool_)
+    selected[sample] = True
     halves = chosen[0::2], chosen[1::2]
 
-    def shown(scale: float) -> list[MaskTable]:
-        """What either half of the views shows with points of a scale."""
+    def tables_of(scale: float) -> list[MaskTable]:
+        """The tables of the two halves of the views, with points of a scale."""
         drawn = isotropic(points, spacing, scale, geometry.opacity)
-        tables = (mask_table(drawn, half, near, thickness, by_sight=True, asked=asked) for half in halves)
+        tables = (mask_table(drawn, half, near, thickness, by_sight=True, selected=selected) for half in halves)
         return [table.of_points(sample) for table in tables]
 
-    judges = {scale: shown(scale) for scale in journal.steps(geometry.scales, "point size")}
+    judges = {scale: tables_of(scale) for scale in journal.steps(geometry.scales, "point size")}
 
     def agreement_of(scale: float) -> float:
-        """How well labels made from either half reproduce the masks of the other."""
-        made = [_labels(table, around, settings) for table in judges.get(scale) or shown(scale)]
+        """How well labels made from each half reproduce the masks of the other."""
+        made = [_labels(table, around, settings) for table in judges.get(scale) or tables_of(scale)]
         return float(np.mean([agreement(judge[1 - half], *made[half]) for half in (0, 1) for judge in judges.values()]))
 
     best, found = search(geometry.scales, agreement_of)
@@ -101,12 +100,12 @@ def choose_scale(
 
 
 def search(scales: Sequence[float], agreement_of: Callable[[float], float]) -> tuple[float, dict[float, float]]:
-    """The best of scales; where it is the smallest or the largest, and clearly the best, one STEP beyond, as long as
-    that is clearly better. And the agreements of all that were tried."""
+    """The best of scales, and the agreements of all that were tried. Where the smallest or the largest is clearly the
+    best, the search goes on by SCALE_STEP as long as the next one is clearly better."""
     found = {scale: agreement_of(scale) for scale in scales}
     best = max(found, key=found.__getitem__)
     while best in (min(found), max(found)) and _is_clear(best, found):
-        beyond = best / STEP if best == min(found) else best * STEP
+        beyond = best / SCALE_STEP if best == min(found) else best * SCALE_STEP
         found[beyond] = agreement_of(beyond)
         if not _is_clear(beyond, found):
             break
@@ -115,11 +114,11 @@ def search(scales: Sequence[float], agreement_of: Callable[[float], float]) -> t
 
 
 def _is_clear(best: float, found: dict[float, float]) -> bool:
-    return found[best] >= CLEARLY + max(value for scale, value in found.items() if scale != best)
+    return found[best] >= MIN_AGREEMENT_GAIN + max(value for scale, value in found.items() if scale != best)
 
 
 def note_scale(choice: ScaleChoice, journal: Journal) -> None:
-    """Note how large a plain cloud's points are drawn, and why."""
+    """Note how large the points of a plain cloud are drawn, and why."""
     journal.notes["gaussian_scale"], journal.notes["held_out_agreement"] = choice.scale, choice.agreements
     if not any(choice.agreements.values()):
         journal.leave_out(LeftOut.CHOICE_OF_SCALE, scale=choice.scale)
@@ -144,10 +143,11 @@ def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
 
 
 def _labels(table: MaskTable, around: Neighborhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
-    """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
+    """The group of masks that each point is in, as mode grouping finds it, and the number of groups.
 
-    By votes alone, not by neighbors: what these mend is the same for all sizes, and a judge that saw hidden points by
-    hearsay would hold it against labels that do not. Nor does it doubt what few views show: half of the views judge.
+    By votes alone, without neighbors: what neighbors correct is the same for all sizes, and labels that neighbors gave
+    to hidden points would count against labels without them. Nor is what few views show doubted: half of the views
+    judge.
     """
     groups = group_masks(table, settings.grouping)
     return assign_by_votes_alone(table, view_votes(table), groups, around, settings.membership), groups.count

@@ -1,7 +1,7 @@
 """What a mask shows through holes between the points of its own object.
 
-A table top of few points lets the floor through everywhere, and seen at a slant its far edge lies as deep as the floor
-begins: over the mask as a whole no gap in depth parts the two. Around each point there is one.
+A table top of few points shows the floor through it everywhere, and at a slant its far edge lies as deep as the nearest
+floor: over the mask as a whole no depth gap separates the two. Around each point there is one.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import numpy as np
 
 from og_pointcloud.kernels import njit
 
-WINDOW = 24
-"""About how many points are looked at around one: as many as `GeometrySettings.neighbors`."""
-STRAIGHT_EDGE = 2 / np.pi
-"""Length of the mean of unit directions that are spread evenly over one side of a straight line."""
+WINDOW_POINTS = 24
+"""Approximate number of points in the window around a point: as many as `GeometrySettings.neighbors`."""
+HALF_PLANE_MEAN_DIRECTION = 2 / np.pi
+"""Length of the mean of unit directions that are spread evenly over a half plane, as seen from a straight edge."""
 
 
 @njit(cache=True, nogil=True)
@@ -21,19 +21,19 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
     """(n,) bool, the points of one mask that lie behind others of it which surround them in the image.
 
     xy: (n, 2) float64, places in an image at depth 1; area: of the mask, there. depth, weight: (n,), depths ascending.
-    gap: the points about a place are parted where depth steps by more than this and by more than that place is wide; a
+    gap: points of a window are separated where depth steps by more than this and by more than the window's width; a
     slanted surface goes as deep as it is wide. The nearest part with front_share of their weight is the surface there.
     What lies behind the surface's rim is not surrounded: rims of masks, and what a depth sensor puts there, are
-    uncertain, and other rules judge them.
+    uncertain, and judged by other rules.
     """
     n = len(depth)
     hidden = np.zeros(n, np.bool_)
     if n == 0 or depth[-1] - depth[0] <= gap:
         return hidden
-    # The points of a cell are looked at in the window of three by three cells about it, which holds WINDOW points where
-    # they lie evenly over the mask. A mask much smaller than its bounding box gets about four cells a point at most.
+    # The window of a cell is three by three cells, which hold WINDOW_POINTS points if these lie evenly over the mask. A
+    # mask much smaller than its bounding box gets at most about four cells a point.
     low, span = np.array([xy[:, 0].min(), xy[:, 1].min()]), np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
-    cell = np.sqrt(max(area * WINDOW / 9, span[0] * span[1] / 4) / n)
+    cell = np.sqrt(max(area * WINDOW_POINTS / 9, span[0] * span[1] / 4) / n)
     cell = max(cell, span.sum() / (4 * n), 1e-12)
     columns, rows = int(span[0] / cell) + 1, int(span[1] / cell) + 1
     start, members = _by_cell(xy, low, cell, columns, rows)
@@ -41,25 +41,25 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
     for middle in range(columns * rows):
         if start[middle] == start[middle + 1]:
             continue
-        # Nothing in the cell lies a gap behind the mask's nearest point: no need to look at its window.
+        # If nothing in the cell lies a gap behind the mask's nearest point, its window does not matter.
         deepest = depth[members[start[middle + 1] - 1]]  # members of a cell ascend
         if deepest - depth[0] <= gap:
             continue
         row = middle // columns
         column = middle - row * columns
         around = max(row - 1, 0), min(row + 2, rows), max(column - 1, 0), min(column + 2, columns)
-        near = depth[_nearest(around, start, members, columns, n)]
+        nearest_depth = depth[_nearest(around, start, members, columns, n)]
         # The window's width in scene units, at that depth.
-        step = max(gap, 3 * cell * near)
-        # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
-        if not deepest - near > step:
+        step = max(gap, 3 * cell * nearest_depth)
+        # What is hidden lies at least a step behind the nearest point: in most cells nothing does.
+        if not deepest - nearest_depth > step:
             continue
-        about = _about(around, start, members, columns, window)
-        begin, end = _front(depth, weight, about, step, front_share)
-        # Points are numbered by depth: one from about[end] on lies behind the surface.
+        around_cell = _points_of_cells(around, start, members, columns, window)
+        begin, end = _front(depth, weight, around_cell, step, front_share)
+        # Points are numbered by depth: one from around_cell[end] on lies behind the surface.
         for point in members[start[middle] : start[middle + 1]]:
-            if end < len(about) and point >= about[end]:
-                hidden[point] = _surrounded(xy, point, about[begin:end])
+            if end < len(around_cell) and point >= around_cell[end]:
+                hidden[point] = _surrounded(xy, point, around_cell[begin:end])
     return hidden
 
 
@@ -82,7 +82,7 @@ def _by_cell(xy, low, cell, columns, rows):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _nearest(around, start, members, columns, n):  # noqa: ANN001, ANN202
-    """The lowest number of n points in these cells: (first row, end of rows, first column, end of columns)."""
+    """The lowest number of the points in these cells, n if none. around: first and end of rows, of columns."""
     nearest = n
     for row in range(around[0], around[1]):
         for cell in range(row * columns + around[2], row * columns + around[3]):
@@ -92,7 +92,7 @@ def _nearest(around, start, members, columns, n):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _about(around, start, members, columns, window):  # noqa: ANN001, ANN202
+def _points_of_cells(around, start, members, columns, window):  # noqa: ANN001, ANN202
     """The points of these cells, ascending, written to ``window``."""
     count = 0
     for row in range(around[0], around[1]):
@@ -100,16 +100,16 @@ def _about(around, start, members, columns, window):  # noqa: ANN001, ANN202
         for k in range(start[row * columns + around[2]], start[row * columns + around[3]]):
             window[count] = members[k]
             count += 1
-    about = window[:count]
-    if count > 4 * WINDOW:  # insertion takes the square of their number
-        about.sort()
+    points = window[:count]
+    if count > 4 * WINDOW_POINTS:  # insertion takes the square of their number
+        points.sort()
     for k in range(1, count):  # by insertion: few points, in runs that ascend already
-        point, place = about[k], k
-        while place > 0 and about[place - 1] > point:
-            about[place] = about[place - 1]
+        point, place = points[k], k
+        while place > 0 and points[place - 1] > point:
+            points[place] = points[place - 1]
             place -= 1
-        about[place] = point
-    return about
+        points[place] = point
+    return points
 
 
 @njit(cache=True, nogil=True)
@@ -123,7 +123,7 @@ def _front(depth, weight, points, gap, front_share):  # noqa: ANN001, ANN202
         if k and depth[points[k]] - depth[points[k - 1]] > gap:
             if mass >= least:
                 return begin, k
-            # A crumb in front is no surface: begin again behind it.
+            # A small run in front is no surface: begin again behind it.
             begin, mass = k, 0.0
         mass += weight[points[k]]
     return 0, len(points)
@@ -138,4 +138,4 @@ def _surrounded(xy, point, others):  # noqa: ANN001, ANN202
         length = np.sqrt(across**2 + down**2)
         if length > 0:
             x, y, count = x + across / length, y + down / length, count + 1
-    return np.sqrt(x**2 + y**2) < STRAIGHT_EDGE * count
+    return np.sqrt(x**2 + y**2) < HALF_PLANE_MEAN_DIRECTION * count

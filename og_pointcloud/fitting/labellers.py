@@ -3,8 +3,8 @@
 grouping  masks that cover the same Gaussians are one instance (grouping.py). No training.
 fast      instance features from the mask table, a two-level codebook, masks matched by Eq. 5 (learned/): the paper's
           objectives without rendering. Deterministic, seconds.
-paper     the same objectives as published: trained by rendering, a view a step (learned/paper.py), each instance
-          matched as rendered alone. The reference of the other two.
+paper     the same objectives as published: trained by rendering, one view a step (learned/paper.py), each instance
+          matched as rendered alone. The reference for the other two.
 
 All return a `Labelling`. In grouping and fast all views then decide every point (membership.py); in mode paper points
 keep their leaf.
@@ -33,7 +33,7 @@ from og_pointcloud.fitting.learned.matching import (
 )
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import settled_points
+from og_pointcloud.fitting.membership import assign_and_mark_spanning
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Labelling:
     """instance_ids: (n,) int32, a row of ``instances``, BACKGROUND or UNOBSERVED. mask_instance: (masks,) int32, the
-    instance that each mask shows, -1 none. certainty: (n,) float32, and expected_iou: (K,) float64, as of `Membership`;
+    instance that each mask shows, -1 none. certainty: (n,) float32, and expected_iou: (K,) float64, see `Membership`;
     None where views did not decide every point."""
 
     instance_ids: NDArray[np.int32]
@@ -59,7 +59,7 @@ class Labelling:
     expected_iou: NDArray[np.float64] | None = None
 
     def of_points(self, rows: NDArray[np.integer] | None) -> Labelling:
-        """The labelling of other points, each as the point in its row of ``rows``; None: of the same points."""
+        """The labelling of other points: point i gets the label of point rows[i]; None: of the same points."""
         if rows is None:
             return self
         certainty = None if self.certainty is None else self.certainty[rows]
@@ -74,7 +74,7 @@ Labeller = Callable[[MaskTable, Surface, FitSettings, Journal], Labelling]
 def grouping(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """Masks joined by the Gaussians they share; no training."""
     with journal.stage("grouping"):
-        # Overlaps of masks are shares: a sample of the points measures them as well.
+        # Overlaps of masks are shares: a sample of the points measures them just as well.
         sample = sample_of_points(surface.gaussians.xyz, settings.grouping.graph_points)
         groups = group_masks(table, settings.grouping, sample)
         votes = view_votes(table)
@@ -99,7 +99,7 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
         matching = match_masks(table, book.leaf, evidence, settings.matching)
     if not settings.matching.settle:
         return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
-    return _settled(table, surface, settings, journal, book.leaf_coarse, matching)
+    return _leaves_decided_by_views(table, surface, settings, journal, book.leaf_coarse, matching)
 
 
 def paper(
@@ -107,7 +107,7 @@ def paper(
 ) -> Labelling:
     """The paper's method: features and codebook trained by rendering, instances matched as rendered alone (Eq. 5).
 
-    work: where the state of the training is kept, so that a run that was killed continues; None: nowhere.
+    work: keeps the state of the training, so that a killed run can resume; None: nothing is kept.
     """
     features, book = trained_by_rendering(table, surface, settings, journal, work)
     return leaves_of_training(table, surface, features, book, settings, journal)
@@ -119,7 +119,7 @@ def trained_by_rendering(
 ) -> tuple[NDArray[np.float32], TrainedCodebook]:  # fmt: skip
     """What mode paper trains: features (n, width) of the first stage, as read, and the codebook.
 
-    source: the blending weights, where they are at hand already.
+    source: the blending weights, if they are available already.
     """
     from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook, train_features
     from og_pointcloud.fitting.learned.rendered_views import RenderedViews
@@ -152,7 +152,7 @@ def leaves_of_training(
     """The leaves of a trained codebook as instances, each with the masks that Eq. 5 accepts for it."""
     options, gaussians = settings.paper, surface.gaussians
     near, views = surface.near, surface.thinned_views()
-    # Leaves with Gaussians become instances 0, 1, ...; of k1 k2 numbers some have none.
+    # Leaves with Gaussians become instances 0, 1, ...; some of the k1 k2 leaves have none.
     used, leaf = np.unique(book.leaf[book.leaf >= 0], return_inverse=True)
     ids = np.full(len(gaussians), -1, np.int32)
     ids[book.leaf >= 0] = leaf
@@ -168,7 +168,7 @@ def leaves_of_training(
         matching = match_masks(table, ids, evidence, options.matching)
     coarse = (used // options.k2).astype(np.int32)
     if options.matching.settle:
-        return _settled(table, surface, settings, journal, coarse, matching)
+        return _leaves_decided_by_views(table, surface, settings, journal, coarse, matching)
     return _leaves_as_instances(table, ids, coarse, matching)
 
 
@@ -184,7 +184,7 @@ def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.fl
     return (table.weights @ features) / np.where(shown > 0, shown, 1)
 
 
-def _settled(
+def _leaves_decided_by_views(
     table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal, coarse: NDArray[np.int32],
     matching: Matching,
 ) -> Labelling:  # fmt: skip
@@ -213,7 +213,7 @@ def _decided_by_views(
     """
     with journal.stage("membership"):
         rgb = surface.scene.points.rgb
-        groups, membership = settled_points(table, votes, groups, surface.neighborhood, settings, rgb)
+        groups, membership = assign_and_mark_spanning(table, votes, groups, surface.neighborhood, settings, rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     if membership.dismissed.any():
@@ -233,13 +233,13 @@ def _decided_by_views(
 def renumbered(
     ids: NDArray[np.int32], group: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Groups that have points become instances 0, 1, ... in their order: (the groups that do, the instance of each
-    point, the instance of each mask, -1 where its group has no point).
+    """Groups that have points become instances 0, 1, ... in order. Returns these groups, the instance of each point,
+    and the instance of each mask, -1 where its group has no point.
 
     ids: (n,) the group of each point, or a state below 0, which stays. group: (masks,) the group of each mask, -1 none.
     """
     used = np.unique(ids[ids >= 0])
-    # At least as long as the lowest state is negative: without any group all of them still index it.
+    # Long enough for negative states, which index from the end, even without any group.
     number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 3, -1, np.int32)
     number[used] = np.arange(len(used), dtype=np.int32)
     return used, np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
@@ -251,7 +251,7 @@ def instances_of_groups(
     ids: NDArray[np.int32],
     count: int,
 ) -> InstanceTable:
-    """What the encoder saw of each of ``count`` instances, and which are parts of others."""
+    """What the encoder saw of each of ``count`` instances, and which ones are parts of others."""
     instances = describe_instances(table, mask_instance, ids, count)
     return replace(instances, part_of=part_of(table, mask_instance, ids, count))
 

@@ -29,25 +29,25 @@ from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
 
 Result = TypeVar("Result")
 
-SEEN_THROUGH = 0.1
-"""Share of a weight through a surface that counts as exposure. Not 0: points that are only ever seen through a surface
-are still decided by the views that see them."""
+SEEN_THROUGH_SHARE = 0.1
+"""Share of a weight seen through a surface that counts as exposure. Not 0, so that points that are only ever seen
+through a surface are still decided by the views that see them."""
 
 
 @dataclass(frozen=True)
 class MaskTable:
     """What every mask of every view shows of every Gaussian, and what shows outside all masks.
 
-    weights: (masks, n) sparse float32, ``A`` above, masks stacked view by view.
+    weights: (masks, n) sparse float32, blending weight of each Gaussian in each mask, in pixels; masks view by view.
     outside: (views, n) sparse float32, the same for each view's pixels without a mask.
     exposure: (views, n) sparse float32, the part of each Gaussian's own splat that reaches the camera: about 1 in
         front, small behind other splats, and smaller still where it only shows through a surface.
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
     mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks. names: (views,), of the views.
-    doubted: (views, n) sparse float32, exposure that was taken from the above as it comes through holes of an object,
-        or as colors speak against it (seen_colors.py; below 0 where they speak for more): it says what masks have in
-        common, not what a point is. None: none.
+    doubted: (views, n) sparse float32, exposure that was removed from the above because it comes through holes of an
+        object, or because colors contradict it (seen_colors.py; below 0 where they raise it): it still counts for how
+        masks overlap, not for what a point is. None: none.
     """
 
     weights: csr_array
@@ -76,7 +76,7 @@ class MaskTable:
         return replace(self, weights=weights, outside=outside, exposure=exposure, doubted=doubted)
 
     def with_doubted(self) -> MaskTable:
-        """The table without doubts: everything is exposed as openly as geometry says."""
+        """The table with all doubted exposure restored, as geometry alone has it."""
         if self.doubted is None:
             return self
         exposure = csr_array(self.exposure + self.doubted)
@@ -94,25 +94,25 @@ def mask_table(
     side_by_side: int | None = None,
     most_in_memory: float = np.inf,
     by_sight: bool = False,
-    asked: NDArray[np.bool_] | None = None,
+    selected: NDArray[np.bool_] | None = None,
 ) -> MaskTable:
     """The mask table of all views, one pass over each.
 
     near: depth of the near plane, scene units. thickness: (n,) how far behind the surface in front of it a Gaussian may
-    lie and still belong to it, scene units; what lies farther is seen through it and counts SEEN_THROUGH. None: all
-    counts alike.
+    lie and still belong to it, scene units; anything farther is seen through it and counts SEEN_THROUGH_SHARE. None:
+    all counts alike.
     work: where the views are kept meanwhile; views that are there already are not rendered. None: in memory.
-    side_by_side: views worked on at once at most, None: as many as there are threads.
-    most_in_memory: bytes of entries; a larger table is in files, mapped.
+    side_by_side: maximum number of views worked on at once; None: the number of threads.
+    most_in_memory: bytes of entries; a larger table is in mapped files.
     by_sight: take what views see along each point's own ray (`sightings.sightings`), not what each Gaussian paints;
-    thickness is then what it says there. asked: (n,) bool, the points that are looked at so; None: all.
+    thickness is then as described there. selected: (n,) bool, the points that rays are cast to; None: all.
     """
     if work is None:
         work = WorkFolder(None)
         work.hold(np.inf, np.inf)
     geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near)
-    # What is not kept no other run will look for: it needs no fingerprint.
-    of_all = fingerprint(*geometry, by_sight, asked) if work.folder is not None else None
+    # What is not kept is not looked for by another run: it needs no fingerprint.
+    of_all = fingerprint(*geometry, by_sight, selected) if work.folder is not None else None
 
     def shown(view: View) -> _ShownView:
         ids = view.mask_map()
@@ -121,10 +121,10 @@ def mask_table(
         def make() -> tuple[NDArray[Any], ...]:
             if not by_sight or thickness is None:
                 return _view_arrays(gaussians, view, ids, near, thickness)
-            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, asked)
+            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, selected)
             return _as_arrays(seen.rows, seen.openness)
 
-        # Of a view only sizes are kept here: its entries may be held, or written to a file, by the work folder.
+        # Only a view's sizes are kept here: the work folder holds its entries, or writes them to a file.
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
         pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
@@ -145,8 +145,8 @@ def mask_table(
 @dataclass(frozen=True)
 class _ShownView:
     """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``, or ``make`` makes anew. sizes: (3,)
-    numbers of entries: in masks, outside of them, of the exposure. pixels: (masks,) int32, area of each. name,
-    mask_features, mask_tracks: as of `View`."""
+    numbers of entries in masks, outside of them, and of the exposure. pixels: (masks,) int32, area of each. name,
+    mask_features, mask_tracks: see `View`."""
 
     name: str
     key: str
@@ -158,7 +158,7 @@ class _ShownView:
 
 
 def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
-    """A fingerprint of all that a view's rows depend on, but for the geometry. ids: its mask map."""
+    """A fingerprint of all that a view's rows depend on except the geometry. ids: its mask map."""
     camera = view.camera
     numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
     return fingerprint(numbers, camera.world_to_camera, ids)
@@ -171,8 +171,8 @@ def _view_arrays(
     near: float,
     thickness: NDArray[np.float32] | None,
 ) -> tuple[NDArray[Any], ...]:
-    """What a view shows: entries of each row (masks + 1,), the last one of pixels without a mask, the entries' columns
-    and values, and columns and values of the view's exposure."""
+    """What a view shows: numbers of entries of each row (masks + 1,), the last for pixels without a mask; the entries'
+    columns and values; and columns and values of the view's exposure."""
     shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
     exposure = _exposure(shown)
     # Pixels that no photograph covers say nothing: a Gaussian with its center there is unseen, not outside of masks.
@@ -202,7 +202,7 @@ def _as_arrays(rows: csr_array, exposure: csr_array) -> tuple[NDArray[Any], ...]
 def _put_together(
     views: list[_ShownView], n: int, work: WorkFolder, most_in_memory: float
 ) -> tuple[csr_array, csr_array, csr_array]:
-    """(weights, outside, exposure) of all views. Each view is let go once it is copied: none is in memory twice."""
+    """(weights, outside, exposure) of all views. Each view is freed once it is copied: none is in memory twice."""
     sizes = sum((view.sizes for view in views), np.zeros(3, np.int64)).tolist()
     # 8 bytes an entry: an int32 column and a float32 value. Sizes are known, so no array grows and moves.
     matrices = [SparseRows(entries, n, 8 * sum(sizes) > most_in_memory) for entries in sizes]
@@ -231,7 +231,7 @@ def stacked_tracks(of_views: Sequence[tuple[NDArray[np.integer] | None, int]]) -
 
 
 def require_sight(exposed: int, masked: int, scene: Scene) -> None:
-    """SceneError where no view shows a point, or no mask does. exposed, masked: how many entries say so."""
+    """SceneError where no view shows a point, or no mask does. exposed, masked: numbers of such entries."""
     if exposed and masked:
         return
     cameras = np.stack([view.camera.center for view in scene.views]) + scene.points.origin
@@ -251,7 +251,7 @@ def require_sight(exposed: int, masked: int, scene: Scene) -> None:
 def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], count: int) -> NDArray[np.float64]:
     """(rows, count) float64: what each row of a table's matrix shows of the points of every instance, in pixels.
 
-    instance_ids: (n,) int32, the instance of each column below ``count``, below 0 none.
+    instance_ids: (n,) int32, the instance of each column, less than ``count``; below 0 none.
     """
     return _weights_by_instance(matrix.indptr, matrix.indices, matrix.data, instance_ids, count)
 
@@ -272,8 +272,8 @@ def _weights_by_instance(indptr, indices, data, instance_ids, count):  # noqa: A
 class SparseRows:
     """A CSR matrix (rows, width) of int32 columns and float32 values that is filled row by row.
 
-    entries: how many it will have at most. on_disk: whether they go to files, mapped, or into memory. Fewer than 2^31,
-    so that int32 counts them: SciPy would turn all indices into int64, twice the memory.
+    entries: their maximum number, less than 2^31 so that int32 counts them: SciPy would turn all indices into int64,
+    twice the memory. on_disk: whether they go to mapped files or into memory.
     """
 
     def __init__(self, entries: int, width: int, on_disk: bool) -> None:
@@ -303,47 +303,47 @@ class SparseRows:
 
 
 def _side_by_side(
-    work: Callable[[View], Result], views: Iterable[View], at_once: int | None = None
+    work: Callable[[View], Result], views: Iterable[View], workers: int | None = None
 ) -> Iterator[Result]:
-    """Work on several views at once, each on one thread: sorting and merging then keep no core waiting.
+    """Work on several views at once, each on one thread: sorting and merging then leave no core idle.
 
     Results come in the order of the views; only a few views are held at a time.
     """
-    coming = iter(views)
-    for view in islice(coming, 1):
+    pending = iter(views)
+    for view in islice(pending, 1):
         yield work(view)  # starts numba's threads: only then is their layer known
-    threads = min(numba.get_num_threads(), at_once or numba.get_num_threads())
+    threads = min(numba.get_num_threads(), workers or numba.get_num_threads())
     layer = numba.threading_layer()  # pyright: ignore[reportPrivateImportUsage]
     if threads == 1 or layer == "workqueue":  # which takes no calls from two threads at once
-        yield from map(work, coming)
+        yield from map(work, pending)
         return
 
-    def alone(view: View) -> Result:
-        numba.set_num_threads(1)  # of this Python thread
+    def single_threaded(view: View) -> Result:
+        numba.set_num_threads(1)  # for this Python thread
         return work(view)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        waiting: deque[Future[Result]] = deque()
+        futures: deque[Future[Result]] = deque()
         try:
-            for view in coming:
-                waiting.append(pool.submit(alone, view))
-                if len(waiting) > threads:  # one more than are worked on, so that no thread waits for the next view
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+            for view in pending:
+                futures.append(pool.submit(single_threaded, view))
+                if len(futures) > threads:  # one more than threads, so that no thread waits for the next view
+                    yield futures.popleft().result()
+            while futures:
+                yield futures.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)  # interrupted, or a view failed: no more are begun
 
 
 def _exposure(view: ViewWeights) -> csr_array:
-    """(1, n) sparse: the weight of each Gaussian in a view, as a part of what it would be with nothing in front.
+    """(1, n) sparse: the weight of each Gaussian in a view, relative to its weight with nothing in front.
 
-    What shows through a surface counts SEEN_THROUGH: the rest of a view's word would be about the surface.
+    What shows through a surface counts SEEN_THROUGH_SHARE: the rest of what the view says is about the surface.
     """
     n = view.rows.shape[1]
     seen = np.bincount(view.rows.indices, view.rows.data, n).astype(np.float64)  # integers where there is nothing
     visible = np.flatnonzero(seen)
-    seen -= (1 - SEEN_THROUGH) * np.bincount(view.through.indices, view.through.data, n)
-    # Of a huge splat so little is in the image that float32 would call it nothing.
+    seen -= (1 - SEEN_THROUGH_SHARE) * np.bincount(view.through.indices, view.through.data, n)
+    # So little of a huge splat may be in the image that float32 would round it to 0.
     part = np.clip(seen[visible] / view.area[visible], np.finfo(np.float32).tiny, 1).astype(np.float32)
     return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, n))

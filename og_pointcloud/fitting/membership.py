@@ -1,6 +1,6 @@
 """Groups of masks -> one state per point: an instance, background, or unobserved. Decided from all views together.
 
-A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
+Whether one mask covers a point matters less than what the *other* views say. Let, for point g and instance k,
 
     for_k(g)       votes for "in a mask of k" (see `view_votes`)
     possible_k(g)  votes on g of the views that have a mask of k
@@ -8,28 +8,28 @@ A mask covers a point or it does not; what matters is what the *other* views say
 
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
 k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. A point in masks of
-several groups is asked of the one with the most votes. But proposers let large things swallow small ones: where that
-group's own views contradict it and a smaller one is sure, the smaller one is asked.
+several groups is tested for the one with the most votes. But proposers let large things swallow small ones: where that
+group's own views contradict it and a smaller group is sure, the smaller one is taken.
 
-Points whose state is clear from that are those that views see openly and agree on. Where no view sees a point openly,
-all votes on it are hearsay: rays that slip through a surface agree about what lies behind it, and are wrong. What
-counts as openly is measured by the scene's other points: in surfaces of several noisy layers little is seen anywhere.
-The clear points show what each view reports of each instance and of background, and these reports, with neighbors and
-colors, say what every point is likeliest of (view_reports.py).
+Points are clear if views see them openly and agree on them. Where no view sees a point openly, its votes are
+unreliable: rays that slip through a surface agree about what lies behind it, and are wrong. Openness is relative to the
+scene's other points: in surfaces of several noisy layers nothing is seen very openly. The clear points show what each
+view reports of each instance and of background. These reports, with neighbors and colors, give every point's most
+probable state (view_reports.py).
 
-Where a proposer misses a cup, its pixels may lie in the mask of its table. What the points then are shows it: such a
-mask holds most of what its view sees of two groups. It is named as its own group still, but from then on tells points
-only that they are of one of the two, and they choose once more.
+Where a proposer misses a cup, its pixels may lie in the mask of its table. The states of the points reveal this: such a
+mask holds most of what its view sees of two groups. It still describes its own group, but from then on votes only for
+"one of the two", and all points are decided once more.
 
-Torn mask edges leave middling shares on the rim of an object, and views that tear it alike call it background. So do
-rays that slip past an edge on what lies behind. The two are told apart by place and color: a background point with a
-middling share becomes one of the instance where it adjoins points that are (hysteresis, as in Canny's edges). And by
-who sees it well: what rays slip past is in masks of views that see it badly and outside those of views that see it
-openly, where of a rim all say alike. So a middling share counts only where it stays one when each vote counts by
-itself once more.
+Torn mask edges leave middling shares on the rim of an object, and views that tear it alike call it background. Rays
+that slip past an edge leave the same on what lies behind. Place and color tell the two apart: a background point with a
+middling share joins the instance where it adjoins points of it (hysteresis, as in Canny's edge detector). Openness
+helps too: the surface behind an edge is in masks of views that see it badly and outside the masks of views that see it
+openly, while all views say the same of a rim. So a middling share counts only if it remains one when each vote is
+weighted by itself once more.
 
-What one view alone has a mask of, and the others show outside all masks, is a thing only if as many views may well have
-missed one: how often they do, the scene's other groups tell.
+If one view alone has a mask of something that the others show outside all masks, it is a thing only if that many views
+may well have missed it: the scene's other groups tell how often views miss.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ from og_pointcloud.settings import FitSettings, MembershipSettings
 
 @dataclass(frozen=True)
 class SceneVotes:
-    """What all votes of a scene say, for points that are a part of it. typical_openness: as of `ViewVotes`.
-    reports: what each view reports of each state."""
+    """What all votes of a scene say, for deciding some of its points. typical_openness: see `ViewVotes`. reports: what
+    each view reports of each state."""
 
     typical_openness: float
     reports: ViewReports
@@ -63,10 +63,10 @@ class SceneVotes:
 
 @dataclass(frozen=True)
 class Membership:
-    """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. certainty: (n,) float32 in [0, 1], how likely views
-    make the state that a point is given, times the part of its neighbors that are in it; 0 where no view sees it.
-    expected_iou: (groups,) float64, of the points given to each group with those that are of it, as far as views tell.
-    detection_rate: (groups,) float32, the part of a group's visible weight that lies in views that have a mask of it.
+    """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. certainty: (n,) float32 in [0, 1], probability of
+    the point's state given the views, times the share of its neighbors with that state; 0 where no view sees it.
+    expected_iou: (groups,) float64, expected IoU of each group's points with its true points, given the views.
+    detection_rate: (groups,) float32, the share of a group's visible weight that lies in views that have a mask of it.
     dismissed: (groups,) bool, groups that the scene's views contradict as a whole. scene: what all votes said."""
 
     instance_ids: NDArray[np.int32]
@@ -77,7 +77,7 @@ class Membership:
     scene: SceneVotes
 
 
-def settled_points(
+def assign_and_mark_spanning(
     table: MaskTable,
     votes: ViewVotes,
     groups: MaskGroups,
@@ -85,14 +85,14 @@ def settled_points(
     settings: FitSettings,
     rgb: NDArray[np.uint8] | None = None,
 ) -> tuple[MaskGroups, Membership]:
-    """Decide the state of every point of a scene, then once more with the masks that these states show to span two
-    groups, which tell of neither. Returns the groups with these masks marked, too."""
-    asked = around, settings.membership, rgb
-    first = assign_points(table, votes, groups, *asked)
-    known = with_spanning(groups, votes, table.mask_view, first.instance_ids, settings.grouping)
-    if (known.spanning == groups.spanning).all():
+    """Decide the state of every point of a scene, mark the masks that these states show to span two groups, and decide
+    once more. Returns the groups with these masks marked, too."""
+    inputs = around, settings.membership, rgb
+    first = assign_points(table, votes, groups, *inputs)
+    marked = with_spanning(groups, votes, table.mask_view, first.instance_ids, settings.grouping)
+    if (marked.spanning == groups.spanning).all():
         return groups, first
-    return known, assign_points(table, votes, known, *asked)
+    return marked, assign_points(table, votes, marked, *inputs)
 
 
 def assign_points(
@@ -104,33 +104,34 @@ def assign_points(
     rgb: NDArray[np.uint8] | None = None,
     scene: SceneVotes | None = None,
 ) -> Membership:
-    """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
-    ends with no point.
+    """Decide the state of every point. Groups keep their numbers, which run from large to small; a dismissed group ends
+    with no point.
 
-    rgb: (n, 3), or None: colors are not asked. scene: of which these points are a part; None: they are all of it.
+    rgb: (n, 3), or None: colors are not used. scene: the scene that these points are part of; None: they are all of it.
     """
     has_mask = views_with_masks(table, groups)
-    # Points choose twice: among all groups, which shows those that are noise, and among the others.
-    of_points = votes_of_points(votes)
-    asked = of_points, groups.told, table.mask_view, has_mask
-    support = _support(*asked, np.ones(groups.count, np.bool_), settings)
+    # First among all groups, which shows the groups that are noise, then among the others.
+    point_votes = votes_of_points(votes)
+    inputs = point_votes, groups.voting_group, table.mask_view, has_mask
+    support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
     rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    support = _support(*asked, ~dismissed, settings)
+    support = _support(*inputs, ~dismissed, settings)
 
     typical = scene.typical_openness if scene else votes.typical_openness
-    openly = _openly(votes.openness, settings.open_share * typical)
-    clear = _clear(support, openly, settings)
+    visibility = _visibility(votes.openness, settings.open_share * typical)
+    clear = _clear(support, visibility, settings)
     weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
-    # What each mask reports: its group, nothing, or that it spans several, under a number of its own after the groups.
-    reporting = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.told]
-    reporting[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
-    of_masks, size = (reporting, table.mask_view), (votes.vote.shape[0], groups.count)
+    # What each mask reports: its group, -1 for nothing, or, if it spans several, a number of its own after the groups.
+    report = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.voting_group]
+    report[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
+    mask_reports, size = (report, table.mask_view), (votes.vote.shape[0], groups.count)
+    known = scene.reports if scene else None
     likely, reports = likely_states(
-        of_points, of_masks, size, clear, support.group, openly, around, weights, scene.reports if scene else None
+        point_votes, mask_reports, size, clear, support.group, visibility, around, weights, known
     )
-    possible = (support.share > settings.possible_share) & (support.share_openly > settings.possible_openly)
-    ids = _completed(likely.ids, support, possible, (table, groups.told), around, weights, settings)
-    certainty = likely.of(ids) * _agreeing(ids, around.index, around.adjoining)
+    possible = (support.share > settings.possible_share) & (support.reweighted_share > settings.possible_openly)
+    ids = _refined(likely.ids, support, possible, (table, groups.voting_group), around, weights, settings)
+    certainty = likely.probability_of(ids) * _neighbor_agreement(ids, around.index, around.adjoining)
     return Membership(
         ids, certainty.astype(np.float32), likely.expected_iou(ids), rate.astype(np.float32), dismissed,
         SceneVotes(typical, reports),
@@ -140,89 +141,88 @@ def assign_points(
 def assign_by_votes_alone(
     table: MaskTable, votes: ViewVotes, groups: MaskGroups, around: Neighborhood, settings: MembershipSettings
 ) -> NDArray[np.int32]:
-    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if they were seen
-    openly alike. For a few views of many: they tell nothing of what each of them reports."""
+    """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all were seen equally
+    openly. For a few of many views: too few to count what each of them reports."""
     has_mask = views_with_masks(table, groups)
-    asked = votes_of_points(votes), groups.told, table.mask_view, has_mask
-    support = _support(*asked, np.ones(groups.count, np.bool_), settings)
+    inputs = votes_of_points(votes), groups.voting_group, table.mask_view, has_mask
+    support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
     _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), replace(settings, missed_chance=0.0))
-    support = _support(*asked, ~dismissed, settings)
+    support = _support(*inputs, ~dismissed, settings)
     ids = np.where(support.share > settings.sure_share, support.group, BACKGROUND)
     ids = np.where(support.total > 0, ids, UNOBSERVED).astype(np.int32)
     weights = around.adjoining.astype(np.float32)
     possible = support.share > settings.possible_share
-    return _completed(ids, support, possible, (table, groups.told), around, weights, settings)
+    return _refined(ids, support, possible, (table, groups.voting_group), around, weights, settings)
 
 
 def views_with_masks(table: MaskTable, groups: MaskGroups) -> NDArray[np.bool_]:
     """(groups, views): whether a view has a mask of a group."""
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
-    told = groups.told
-    has_mask[told[told >= 0], table.mask_view[told >= 0]] = True
+    group = groups.voting_group
+    has_mask[group[group >= 0], table.mask_view[group >= 0]] = True
     return has_mask
 
 
 @dataclass(frozen=True)
 class _Support:
-    """What speaks for the group that a point is of, if it is of any. group: (n,) int32, -1 where there is none.
-    votes: (n,) float64, votes for it. possible: (n,) all votes of views that have a mask of it. total: (n,) all votes.
-    share_openly: (n,) the part of the possible votes that it has where each counts by itself once more: of two views
-    that differ, the one that sees the point more openly knows better.
-    """
+    """Support for the best group of each point. group: (n,) int32, -1 where there is none. votes: (n,) float64, votes
+    for it. possible: (n,) all votes of views that have a mask of it. total: (n,) all votes. reweighted_share: (n,) its
+    share of the possible votes when each is weighted by itself once more: of two views that differ, the one that sees
+    the point more openly knows better."""
 
     group: NDArray[np.int32]
     votes: NDArray[np.float64]
     possible: NDArray[np.float64]
     total: NDArray[np.float64]
-    share_openly: NDArray[np.float64]
+    reweighted_share: NDArray[np.float64]
 
     @property
     def share(self) -> NDArray[np.float64]:
-        """(n,) the part of the possible votes that the group has."""
+        """(n,) the group's share of the possible votes."""
         return self.votes / np.maximum(self.possible, 1e-12)
 
     def of_state(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(n,) in [0, 1]: the part of the possible votes that is for each point's state; 0 where that is UNOBSERVED."""
+        """(n,) in [0, 1]: the share of the possible votes for each point's state; 0 where that is UNOBSERVED."""
         share = np.where((self.group >= 0) & (ids == self.group), self.share, 1 - self.share)
         return np.where(ids != UNOBSERVED, np.clip(share, 0, 1), 0)
 
 
-def _openly(openness: NDArray[np.float32], least: float) -> NDArray[np.float32]:
-    """(n,) in [0, 1] how openly points are seen: 1 from an openness of ``least`` on. 0 where no view sees them."""
-    return np.minimum(1, openness / max(least, np.finfo(np.float32).tiny)).astype(np.float32)
+def _visibility(openness: NDArray[np.float32], full_openness: float) -> NDArray[np.float32]:
+    """(n,) in [0, 1] how openly points are seen: 1 from ``full_openness`` on, 0 where no view sees them."""
+    return np.minimum(1, openness / max(full_openness, np.finfo(np.float32).tiny)).astype(np.float32)
 
 
-def _clear(support: _Support, openly: NDArray[np.float32], settings: MembershipSettings) -> NDArray[np.int32]:
-    """(n,) the state of each point that is seen openly and that views agree on; UNOBSERVED of all others.
+def _clear(support: _Support, visibility: NDArray[np.float32], settings: MembershipSettings) -> NDArray[np.int32]:
+    """(n,) the state of each point that is seen openly and that views agree on; UNOBSERVED for all others.
 
-    Nor is a point clear that hardly any of its votes are for an instance, though no view that has a mask of it speaks
-    against it: one ray that slips through would decide.
+    A point is not clear either where hardly any of all votes are for its group, even if no view that has a mask of the
+    group contradicts it: one ray that slips through would decide.
     """
     ids = np.where(support.share < settings.possible_share, BACKGROUND, UNOBSERVED)
     agreed = (support.share > settings.sure_share) & (support.votes > settings.sure_votes * support.total)
     ids = np.where(agreed, support.group, ids)
-    return np.where(openly == 1, ids, UNOBSERVED).astype(np.int32)
+    return np.where(visibility == 1, ids, UNOBSERVED).astype(np.int32)
 
 
-def _completed(
+def _refined(
     ids: NDArray[np.int32],
     support: _Support,
     possible: NDArray[np.bool_],
-    shown: tuple[MaskTable, NDArray[np.int32]],
+    masks: tuple[MaskTable, NDArray[np.int32]],
     around: Neighborhood,
     weights: NDArray[np.float32],
     settings: MembershipSettings,
 ) -> NDArray[np.int32]:
-    """The states with what only their place tells: possible points of an instance that adjoin it, pieces that are seen
-    through it, and what no view sees. shown: the mask table, and the group of each mask."""
+    """The states corrected by place: possible points join an instance that they adjoin, pieces seen through an instance
+    leave it, unseen points are filled in. masks: the mask table, and the group of each mask."""
     ids = _grow(ids, support.group, possible, around.index, weights, settings.growth_votes)
-    # What is seen through an instance is no part of it; what no view saw is as its neighbors are.
-    ids = _without_islands(ids, support.share, instance_area(*shown, ids), around, settings.island_share)
+    # What is seen through an instance is no part of it; what no view saw takes the state of its neighbors.
+    ids = _without_islands(ids, support.share, instance_area(*masks, ids), around, settings.island_share)
     return _fill_unobserved(ids, around)
 
 
 def _support(
-    of_points: VotesOfPoints,
+    point_votes: VotesOfPoints,
     group: NDArray[np.int32],
     mask_view: NDArray[np.int32],
     has_mask: NDArray[np.bool_],
@@ -231,14 +231,15 @@ def _support(
 ) -> _Support:
     """The support of all points.
 
-    group: (masks,) the group of each mask, groups by what they show, largest first. mask_view: (masks,) the view of
-    each. has_mask: (groups, views), whether a view has a mask of a group. allowed: (groups,) those that may be chosen.
+    group: (masks,) the group of each mask; groups are sorted by what they show, largest first. mask_view: (masks,) the
+    view of each. has_mask: (groups, views), whether a view has a mask of a group. allowed: (groups,) those to choose
+    from.
     """
     found = []
-    for some in of_points:
-        votes = some()
-        best, *of_best = _best_group(*votes, group, has_mask, allowed, settings.sure_share)
-        found.append((best, *of_best, _share_openly(*votes, group, mask_view, has_mask, best)))
+    for chunk in point_votes:
+        votes = chunk()
+        best, *best_votes = _best_group(*votes, group, has_mask, allowed, settings.sure_share)
+        found.append((best, *best_votes, _reweighted_share(*votes, group, mask_view, has_mask, best)))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
@@ -246,8 +247,8 @@ def _support(
 def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: ANN001, ANN202
     """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total.
 
-    Where views that have a mask of that group contradict it, and a smaller group is sure, that one is taken: proposers
-    let a shelf swallow the book on it in half of the views; no view that knows the book shows it as shelf.
+    Where views that have a mask of that group contradict it, and a smaller group is sure, the smaller one is taken:
+    proposers let a shelf swallow the book on it in half of the views; no view that knows the book shows it as shelf.
     """
     (mask_start, of_mask), (view_start, of_view) = masks, views
     n = len(mask_start) - 1
@@ -259,7 +260,7 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
         begin, end = mask_start[g], mask_start[g + 1]
         for e in range(view_start[g], view_start[g + 1]):
             total[g] += of_view[e].vote
-        sure, of_sure, asked_sure = -1, 0.0, 0.0
+        sure, sure_votes, sure_possible = -1, 0.0, 0.0
         for e in range(begin, end):
             k = group[of_mask[e].row]
             if k < 0 or not allowed[k]:
@@ -270,84 +271,84 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
                 before += 1
             if before < e:
                 continue
-            # Of the views, those that have a mask of the group could have voted for it.
-            of_group, asked = 0.0, 0.0
-            for other in range(e, end):
-                if group[of_mask[other].row] == k:
-                    of_group += of_mask[other].vote
+            # Only views that have a mask of the group could have voted for it.
+            votes_k, possible_k = 0.0, 0.0
+            for later in range(e, end):
+                if group[of_mask[later].row] == k:
+                    votes_k += of_mask[later].vote
             for view in range(view_start[g], view_start[g + 1]):
                 if has_mask[k, of_view[view].row]:
-                    asked += of_view[view].vote
-            if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
-                best[g], votes[g], possible[g] = k, of_group, asked
-            if of_group > sure_share * asked and (of_group > of_sure or (of_group == of_sure and k < sure)):
-                sure, of_sure, asked_sure = k, of_group, asked
+                    possible_k += of_view[view].vote
+            if votes_k > votes[g] or (votes_k == votes[g] and k < best[g]):
+                best[g], votes[g], possible[g] = k, votes_k, possible_k
+            if votes_k > sure_share * possible_k and (votes_k > sure_votes or (votes_k == sure_votes and k < sure)):
+                sure, sure_votes, sure_possible = k, votes_k, possible_k
         if sure > best[g] and votes[g] <= sure_share * possible[g]:
-            best[g], votes[g], possible[g] = sure, of_sure, asked_sure
+            best[g], votes[g], possible[g] = sure, sure_votes, sure_possible
     return best, votes, possible, total
 
 
 @njit(cache=True, parallel=True)
-def _share_openly(masks, views, group, mask_view, has_mask, best):  # noqa: ANN001, ANN202
-    """(n,) `_Support.share_openly` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
+def _reweighted_share(masks, views, group, mask_view, has_mask, best):  # noqa: ANN001, ANN202
+    """(n,) `_Support.reweighted_share` of each point's ``best`` group; 0 where it has none. Masks ascend by view."""
     (mask_start, of_mask), (view_start, of_view) = masks, views
     share = np.zeros(len(best))
     for g in prange(len(best)):
         if best[g] < 0:
             continue
-        e, of_group, asked = mask_start[g], 0.0, 0.0
+        e, group_votes, possible = mask_start[g], 0.0, 0.0
         for view in range(view_start[g], view_start[g + 1]):
             inside = 0.0
             while e < mask_start[g + 1] and mask_view[of_mask[e].row] <= of_view[view].row:
                 if group[of_mask[e].row] == best[g]:
                     inside += of_mask[e].vote
                 e += 1
-            of_group += inside * of_view[view].vote
+            group_votes += inside * of_view[view].vote
             if has_mask[best[g], of_view[view].row]:
-                asked += of_view[view].vote ** 2
-        share[g] = of_group / asked if asked > 0 else 0.0
+                possible += of_view[view].vote ** 2
+        share[g] = group_votes / possible if possible > 0 else 0.0
     return share
 
 
 def _contradicted(
     support: _Support, votes: ViewVotes, views: NDArray[np.integer], settings: MembershipSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Detection rate per group, and the groups that are noise of the proposer. views: (groups,) how many have a mask of
-    each.
+    """Detection rate per group, and the groups that are noise of the proposer. views: (groups,) number of views with a
+    mask of each.
 
     How often the proposer misses is a property of the scene's masks: a detector may find a chair in a third of the
     views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight.
-    Noise too is what a single view has a mask of and no other shows in any, where the chance that all of these missed a
-    thing is small. That chance is of all groups, and of one more that was never found: few tell no rate exactly.
+    Also noise is what one view alone has a mask of, where it is unlikely that all others missed it. This follows from
+    the detection rate of all groups and one more that was never detected: few groups give no exact rate.
     """
     count, sure = len(views), (support.group >= 0) & (support.share > 0.5)
     group = support.group[sure]
 
-    def of_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.bincount(group, values[sure], count).astype(np.float64, copy=False)
 
-    visible, mass = of_group(support.total), of_group(support.votes)
-    rate = of_group(support.possible) / np.maximum(visible, 1e-12)
+    visible, mass = per_group(support.total), per_group(support.votes)
+    rate = per_group(support.possible) / np.maximum(visible, 1e-12)
     if mass.sum() == 0:
         return rate, np.ones(count, bool)
     masked = np.asarray(votes.in_mask.sum(axis=0), np.float64).ravel()  # votes for any mask
     order = np.argsort(rate, kind="stable")
     typical = rate[order[np.searchsorted(np.cumsum(mass[order]), 0.5 * mass.sum())]]
     points = np.maximum(np.bincount(group, minlength=count), 1)
-    alone = (views == 1) & (of_group(masked - support.votes) < 0.5 * points)
-    found = np.average(rate, weights=mass) * count / (count + 1)
-    chance = (1 - found) ** (of_group(support.total - masked) / points)
-    return rate, (rate < settings.rate_share * typical) | (mass == 0) | (alone & (chance < settings.missed_chance))
+    single = (views == 1) & (per_group(masked - support.votes) < 0.5 * points)
+    detected = np.average(rate, weights=mass) * count / (count + 1)
+    p_missed = (1 - detected) ** (per_group(support.total - masked) / points)
+    return rate, (rate < settings.rate_share * typical) | (mass == 0) | (single & (p_missed < settings.missed_chance))
 
 
 @njit(cache=True)
-def _grow(ids, best, possible, neighbors, weights, votes):  # noqa: ANN001, ANN202
-    """Hysteresis: possible points join their best group while a share ``votes`` of the adjoining points, by weight, is
-    in it.
+def _grow(ids, best, possible, neighbors, weights, min_share):  # noqa: ANN001, ANN202
+    """Hysteresis: possible points join their best group while at least ``min_share`` of the adjoining points, by
+    weight, are in it.
 
     Rounds, not a flood in index order: the result does not depend on how the points are ordered.
     """
-    # In a round all waiting points look at the states before it; those that join are seen by the next.
+    # In a round all waiting points look at the states before it; those that join count from the next round on.
     waiting = np.flatnonzero(possible & (ids < 0))
     while len(waiting):
         joins = np.zeros(len(waiting), np.bool_)
@@ -358,7 +359,7 @@ def _grow(ids, best, possible, neighbors, weights, votes):  # noqa: ANN001, ANN2
                 total += weights[g, k]
                 if ids[neighbors[g, k]] == best[g]:
                     joined += weights[g, k]
-            joins[i] = joined > 0 and joined >= votes * total
+            joins[i] = joined > 0 and joined >= min_share * total
         if not joins.any():
             break
         for i in range(len(waiting)):
@@ -369,9 +370,9 @@ def _grow(ids, best, possible, neighbors, weights, votes):  # noqa: ANN001, ANN2
 
 
 @njit(cache=True, parallel=True)
-def _agreeing(ids, neighbors, adjoining):  # noqa: ANN001, ANN202
-    """(n,) float64: the part of each point's adjoining points that have its state; 1 where none adjoins."""
-    agreeing = np.ones(len(ids))
+def _neighbor_agreement(ids, neighbors, adjoining):  # noqa: ANN001, ANN202
+    """(n,) float64: the share of each point's adjoining points that have its state; 1 where none adjoins."""
+    agreement = np.ones(len(ids))
     for g in prange(len(ids)):
         same, count = 0, 0
         for k in range(neighbors.shape[1]):
@@ -379,12 +380,12 @@ def _agreeing(ids, neighbors, adjoining):  # noqa: ANN001, ANN202
                 count += 1
                 same += ids[neighbors[g, k]] == ids[g]
         if count:
-            agreeing[g] = same / count
-    return agreeing
+            agreement[g] = same / count
+    return agreement
 
 
 def instance_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
-    """(n,) float64: pixels of blending weight that the masks of each point's own instance put on it."""
+    """(n,) float64: blending weight, in pixels, that the masks of each point's own instance put on it."""
     weights = table.weights
     area = np.zeros(len(ids))
     _add_area(weights.indptr, weights.indices, weights.data, group, ids, area)
@@ -393,7 +394,7 @@ def instance_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.in
 
 @njit(cache=True)
 def _add_area(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
-    """Adds to ``area`` what each mask shows of points of its own group; masks without a group are passed over."""
+    """Adds to ``area`` what each mask shows of points of its own group; masks without a group are skipped."""
     for row in range(len(indptr) - 1):
         for e in range(indptr[row] if group[row] >= 0 else indptr[row + 1], indptr[row + 1]):
             if ids[indices[e]] == group[row]:
@@ -405,16 +406,15 @@ def _without_islands(
     share: NDArray[np.float64],
     area: NDArray[np.float64],
     neighborhood: Neighborhood,
-    least: float,
+    min_share: float,
 ) -> NDArray[np.int32]:
-    """Take from each instance the connected pieces beside its main one that are not of it by a majority of votes, or
-    whose points show less than ``least`` of what the main piece's do.
+    """Take from each instance the connected pieces, other than its main one, that have no majority of votes for it, or
+    whose points show less than ``min_share`` of what those of the main piece do.
 
-    A floor that no view sees but through the table top above it has only votes for the table; but of the pixels of the
-    table's masks nearly all the weight stays on the top. A part of the object cut off by an occluder is seen as openly
-    as the rest of it.
+    A floor that views only see through the table top above it has votes for the table alone, but nearly all the weight
+    of the table's masks stays on the top. A part of the object cut off by an occluder is seen as openly as the rest.
     """
-    # Pieces: connected components of adjoining points of one instance. density: what masks show of a point, on average.
+    # Pieces: connected components of adjoining points of one instance. density: mean area of a piece's points.
     n = len(ids)
     source = np.repeat(np.arange(n), neighborhood.index.shape[1])
     target = neighborhood.index.ravel()
@@ -424,25 +424,25 @@ def _without_islands(
     labelled = np.flatnonzero(ids >= 0)
     piece_area, points = np.bincount(piece, area, pieces), np.bincount(piece, minlength=pieces)
     density, majority = piece_area / points, np.bincount(piece, share, pieces) > 0.5 * points
-    # The main piece of each instance is the one its masks show most of: written last, it stays.
+    # The main piece of each instance is the one that its masks show most of: it is written last.
     order = labelled[np.argsort(piece_area[piece[labelled]], kind="stable")]
     main = np.zeros(int(ids.max(initial=-1)) + 1, np.int64)
     main[ids[order]] = piece[order]
-    own, main_piece = piece[labelled], main[ids[labelled]]
-    island = (own != main_piece) & (~majority[own] | (density[own] < least * density[main_piece]))
+    part, main_part = piece[labelled], main[ids[labelled]]
+    island = (part != main_part) & (~majority[part] | (density[part] < min_share * density[main_part]))
     kept = ids.copy()
     kept[labelled[island]] = UNOBSERVED
     return kept
 
 
 def _fill_unobserved(ids: NDArray[np.int32], neighborhood: Neighborhood) -> NDArray[np.int32]:
-    """Points that no view saw copy the state of their nearest adjoining observed point; the rest stay unobserved."""
+    """Points that no view saw copy the state of their nearest adjoining observed point; others stay unobserved."""
     if neighborhood.index.shape[1] == 0:
         return ids  # one point has no neighbors
     hidden = np.flatnonzero(ids == UNOBSERVED)
-    near = ids[neighborhood.index[hidden]]
-    usable = neighborhood.adjoining[hidden] & (near != UNOBSERVED)
+    neighbor_ids = ids[neighborhood.index[hidden]]
+    usable = neighborhood.adjoining[hidden] & (neighbor_ids != UNOBSERVED)
     first = np.argmax(usable, axis=1)
     filled = ids.copy()
-    filled[hidden] = np.where(usable.any(axis=1), near[np.arange(len(hidden)), first], UNOBSERVED)
+    filled[hidden] = np.where(usable.any(axis=1), neighbor_ids[np.arange(len(hidden)), first], UNOBSERVED)
     return filled

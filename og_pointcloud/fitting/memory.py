@@ -19,8 +19,8 @@ from numpy.typing import DTypeLike, NDArray
 from og_pointcloud.errors import OgPointcloudError
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-LEAST = 64 * 10**6
-"""Less memory than this is taken for a mistyped unit: importing the libraries of a fit takes more."""
+MIN_MEMORY_BYTES = 64 * 10**6
+"""Less memory than this is treated as a mistyped unit: importing the libraries of a fit takes more."""
 CGROUPS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -36,13 +36,14 @@ def parse_memory(text: str) -> int:
         value = int(float(match[1]) * UNITS[match[2].upper()]) if match else 0
     except (ValueError, OverflowError):
         value = 0
-    if value < LEAST:
-        raise OgPointcloudError(f"memory is '{text}'; expected a size of at least {LEAST // 10**6}MB, such as 4GB")
+    if value < MIN_MEMORY_BYTES:
+        least = MIN_MEMORY_BYTES // 10**6
+        raise OgPointcloudError(f"memory is '{text}'; expected a size of at least {least}MB, such as 4GB")
     return value
 
 
 def free_memory() -> int:
-    """Bytes that this process could still take: what the machine has free, or what its container leaves it."""
+    """Bytes that this process could still take: what the machine has free, or what its container allows."""
     free = [_available()]
     for limit, used in CGROUPS:
         try:
@@ -53,17 +54,17 @@ def free_memory() -> int:
 
 
 def _available() -> int:
-    """Bytes that the machine could give without swapping, as far as the system tells."""
-    if available := _told_by_linux("/proc/meminfo", "MemAvailable:"):
+    """Bytes available without swapping, as far as the system reports them."""
+    if available := _proc_bytes("/proc/meminfo", "MemAvailable:"):
         return available
-    try:  # no Linux: count on most of what is built in
+    try:  # no Linux: assume most of the installed memory
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4
     except (AttributeError, ValueError, OSError):  # Windows: a cautious guess
         return 4 * 10**9
 
 
-def _told_by_linux(file: str, entry: str) -> int:
-    """Bytes that a line of a file under /proc says; 0 where there is none."""
+def _proc_bytes(file: str, entry: str) -> int:
+    """Bytes that an entry of a file under /proc gives; 0 where there is none."""
     try:
         lines = Path(file).read_text().splitlines()
     except OSError:
@@ -81,7 +82,7 @@ def memory_in_use() -> int:
 
 def peak_memory() -> int:
     """The most memory that this process has held, in bytes; 0 where the system does not tell."""
-    return _told_by_linux("/proc/self/status", "VmHWM:")
+    return _proc_bytes("/proc/self/status", "VmHWM:")
 
 
 def memory_left(limit: int | None) -> int:

@@ -1,7 +1,7 @@
 """Results of OpenGaussian runs -> LabelledCloud: ``point_cloud.ply`` with ``cluster_lang.npz``.
 
-The .ply is a trained 3DGS file (the six ``ins_feat_*`` properties that OpenGaussian adds were clustered already and are
-not read). The .npz holds the outcome, one row per leaf of the two-level codebook (k1 k2 of them, many empty):
+The .ply is a trained 3DGS file (the six ``ins_feat_*`` properties that OpenGaussian adds are clustered already and not
+read). The .npz holds the result, one row per leaf of the two-level codebook (k1 k2 leaves, many of them empty):
 
   ``leaf_feat``   (K, D) floats, mean CLIP feature of the leaf's masks, a zero row where no mask matched
   ``leaf_score``  (K,) floats, mean score of those matches

@@ -1,8 +1,8 @@
-"""A mask table of views -> one of photographs: what was cut into several views speaks with one voice again.
+"""A mask table of views -> one of photographs: views that were cut from one photograph are joined again.
 
-An image too wide for a pinhole is several views (formats/faces.py), of which each draws its points alone. To grouping
-and to votes they are one: a mask cut at a border of faces is one mask, a view that shows a thing in one face says of
-points in the others that they are not of it, and a panorama is one witness instead of six.
+An image too wide for a pinhole is split into several views (formats/faces.py), each rendered by itself. For grouping
+and votes they are one: a mask cut at a border of faces is one mask, a view that shows a thing in one face tells points
+in the others that they are not part of it, and a panorama is one witness instead of six.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Photographs:
         return cls(tuple(name for name, _ in number), np.array(of_view, np.int32), of_mask, first)
 
     def joined(self, table: MaskTable) -> MaskTable:
-        """The table of the views as one of the photographs. It takes their place: their entries may be overwritten."""
+        """The table of photographs from one of views. It replaces that one, whose entries may be overwritten."""
         if len(self.names) == len(self.of_view):
             return table
         views = self.of_view, len(self.names)
@@ -68,11 +68,11 @@ class Photographs:
         )
 
 
-def _summed(matrix: csr_array, whole: NDArray[np.integer], count: int) -> csr_array:
-    """(count, n) sparse: the sums of the rows that are parts of each whole."""
-    parts = np.argsort(whole, kind="stable")
-    first = np.searchsorted(whole[parts], np.arange(count + 1))
-    # In place where rows are taken in their order: what is written then never passes what is still to be read.
+def _summed(matrix: csr_array, target: NDArray[np.integer], count: int) -> csr_array:
+    """(count, n) sparse: the sums of the rows with each target. target: (rows,) the row of the result for each row."""
+    parts = np.argsort(target, kind="stable")
+    first = np.searchsorted(target[parts], np.arange(count + 1))
+    # In place if rows are taken in order: writing then never overtakes reading.
     columns, values = matrix.indices, matrix.data
     if (np.diff(parts) < 0).any():
         columns, values = scratch_like(columns, np.int32), scratch_like(values, np.float32)
@@ -82,8 +82,7 @@ def _summed(matrix: csr_array, whole: NDArray[np.integer], count: int) -> csr_ar
 
 @njit(cache=True)
 def _add_rows(matrix, parts, first, n, columns, values):  # noqa: ANN001, ANN202
-    """Writes the entries of the sums, row by row, columns as they first occur in a sum's parts. Returns where rows
-    begin."""
+    """Writes the entries of the sums, row by row, columns in the order they first occur. Returns the row starts."""
     indptr, indices, data = matrix
     place = np.full(n, -1, np.int64)  # of a column's entry; one before this row's begin is of an earlier row
     starts = np.zeros(len(first), np.int32)

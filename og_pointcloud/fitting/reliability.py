@@ -3,19 +3,18 @@
 Labels are made anew from either half of the views, every other one by name, from the rows that the mask table has
 already. The reliability of an instance is the product of three shares in [0, 1]:
 
-    again   how far its points are those that a half gives its look (Dice: twice those that are both, over the sum of
-            both), mean of both halves. Few views, geometry that hides the wrong things, wrong poses and masks that are
-            cut otherwise in every view lower it
-    named   of its masks, those whose own feature, alone, is nearest to the instance's look. An encoder that errs, and
-            masks that span several things, lower it
+    again   Dice coefficient of its points with those that a half gives its look, mean of both halves. Few views,
+            geometry that hides the wrong things, wrong poses, and masks that are cut differently in every view lower it
+    named   the share of its masks whose own feature, alone, is nearest to the instance's look. An encoder that errs,
+            and masks that span several things, lower it
     expected
-            the IoU of its points with all that is of it, where every point is as likely in each state as all views
-            together make it (view_reports.py). Both halves may agree on what is wrong, as rays slip through a surface
-            in all views: this is lower even so, where views contradict them
+            expected IoU of its points with its true points, under the state probabilities from all views together
+            (view_reports.py). Both halves may agree on an error, as rays slip through a surface in all views: this
+            share is lower even then if views contradict it
 
-Instances are of one look where their descriptors are alike once what all masks have in common is taken away: two
-chairs are, and either may be found where the other was. What all views get wrong in the same way, no half can tell.
-Over `examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
+Instances have the same look if their descriptors are alike after what all masks have in common is removed: two chairs
+do, and either may be found in place of the other. No half can reveal an error that all views share. Over
+`examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ from og_pointcloud.rendering.geometry import neighborhood, sample_of_points
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
-FEWEST_VIEWS = 4
-"""Views needed: of fewer, a half has one view, which nothing in it contradicts."""
-SAME_LOOK = 0.5
-"""Two instances are of one look from this cosine of their descriptors on, taken without what all masks share. Unrelated
+MIN_VIEWS = 4
+"""With fewer views, a half may have one view, which nothing in it contradicts."""
+SAME_LOOK_COSINE = 0.5
+"""Two instances have the same look above this cosine of their descriptors, without what all masks share. Unrelated
 things have about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
-ROWS_AT_ONCE = 1 << 24
+MAX_COSINES = 1 << 24
 """Cosines held at once: 128 MB in float64."""
-ROWS = 16
+ROWS_PER_CUT = 16
 """Rows cut out of a mask table at once: it may be mapped from a file, and larger than memory."""
 
 Bools = NDArray[np.bool_]
@@ -50,8 +49,8 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Reliability:
-    """again, named, expected: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was
-    judged. alone: share of the judged points in instances that one of the halves does not see."""
+    """again, named, expected: (K,) in [0, 1] as above; NaN where an instance has no feature or no judged point. alone:
+    the share of judged points in instances that are unseen in one of the halves."""
 
     again: NDArray[np.float64]
     named: NDArray[np.float64]
@@ -70,14 +69,14 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
     table, surface: what it was made from. Of a larger cloud a sample of ``geometry.held_out_points`` points is judged.
     """
     masked = sorted(np.unique(table.mask_view).tolist(), key=lambda index: table.names[index])
-    if len(masked) < FEWEST_VIEWS or not len(labelling.instances):
+    if len(masked) < MIN_VIEWS or not len(labelling.instances):
         return None
     sample = sample_of_points(surface.gaussians.xyz, settings.geometry.held_out_points)
     judged = _of_points(surface, sample, settings)
     ids = labelling.instance_ids[sample]
     looks, count = _Looks(table, labelling.instances), len(labelling.instances)
     points = np.bincount(ids[ids >= 0], minlength=count)
-    # Halves of every other view: each then looks at the scene from all around. Either counts half.
+    # Halves of every other view, so that each sees the scene from all sides. Each counts half.
     again, unseen = np.zeros(count), np.zeros(len(ids), bool)
     for half in (masked[0::2], masked[1::2]):
         part = _of_views(table, np.sort(half), sample)
@@ -85,7 +84,7 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
         again += _again(ids, _named_by(part, judged, looks, settings), looks, points) / 2
     known = looks.described & (points > 0)
     alone = float(unseen[ids >= 0].mean()) if (ids >= 0).any() else 0.0
-    # Of points that keep their leaf no view said how likely that is.
+    # Points that keep their leaf have no state probabilities.
     expected = np.ones(count) if labelling.expected_iou is None else labelling.expected_iou
     again, named, expected = (
         np.where(known, share, np.nan) for share in (again, _named(table, labelling, looks), expected)
@@ -114,14 +113,14 @@ class _Looks:
         return total, described
 
     def without_common(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Unit rows of what features have beyond the mean of all masks of the scene."""
+        """Unit rows of the features minus the mean of all masks of the scene."""
         return unit_rows(unit_rows(features.astype(np.float64)) - self.common)
 
     def nearest(self, directions: NDArray[np.floating]) -> NDArray[np.int64]:
         """The instance whose look is nearest to each direction, -1 where none has one."""
         if not len(self._rows):
             return np.full(len(directions), -1)
-        step = max(1, ROWS_AT_ONCE // len(self._rows))
+        step = max(1, MAX_COSINES // len(self._rows))
         chunks = [directions[low : low + step] for low in range(0, len(directions), step)]
         found = [(chunk @ self.direction[self._rows].T).argmax(axis=1) for chunk in chunks]
         return self._rows[np.concatenate(found)] if found else np.zeros(0, np.int64)
@@ -131,22 +130,20 @@ class _Looks:
         # A cosine for each different pair: points are many, pairs of instances few.
         pairs, place = np.unique(np.stack([first, second]), axis=1, return_inverse=True)
         cosine = self.direction[np.maximum(pairs, 0)].prod(axis=0).sum(axis=1)
-        same = ((pairs[0] == pairs[1]) | (cosine > SAME_LOOK)) & (pairs >= 0).all(axis=0)
+        same = ((pairs[0] == pairs[1]) | (cosine > SAME_LOOK_COSINE)) & (pairs >= 0).all(axis=0)
         return same[place.ravel()]
 
 
 def _again(
     ids: NDArray[np.int32], name: NDArray[np.int64], looks: _Looks, points: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """(K,) Dice coefficient of each instance with what a half gives its look. points: (K,) how many are of it.
-
-    name: (n,) the instance that a half names each point. A point that it names wrongly counts against the instance that
-    it names, and is missing from its own.
-    """
+    """(K,) Dice coefficient of each instance with the points that a half gives its look. points: (K,) its number of
+    points. name: (n,) the instance that a half gives each point. A wrongly named point counts against the instance that
+    it is given, and is missing from its own."""
     same = looks.alike(ids, name)
-    beyond = np.bincount(name[~same & (name >= 0)], minlength=len(points))
-    both = np.bincount(ids[same], minlength=len(points))
-    return 2 * both / np.maximum(points + both + beyond, 1)
+    false_positives = np.bincount(name[~same & (name >= 0)], minlength=len(points))
+    true_positives = np.bincount(ids[same], minlength=len(points))
+    return 2 * true_positives / np.maximum(points + true_positives + false_positives, 1)
 
 
 def _named_by(table: MaskTable, surface: Surface, looks: _Looks, settings: FitSettings) -> NDArray[np.int64]:
@@ -189,7 +186,7 @@ def _cut(matrix: csr_array, rows: NDArray[np.int64], columns: NDArray[np.int64])
     if not len(rows):
         return csr_array((0, len(columns)), dtype=matrix.dtype)
     chosen = slice(None) if len(columns) == matrix.shape[1] else columns
-    cuts = [csr_array(matrix[rows[low : low + ROWS]])[:, chosen] for low in range(0, len(rows), ROWS)]
+    cuts = [csr_array(matrix[rows[low : low + ROWS_PER_CUT]])[:, chosen] for low in range(0, len(rows), ROWS_PER_CUT)]
     return csr_array(vstack(cuts, format="csr"))
 
 
@@ -208,7 +205,7 @@ def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings)
 
 def likely_cause(found: Reliability) -> str:
     """In words, why a reliability is low. Wrong poses are found by the checks of the capture (checking/)."""
-    # What a half does not see it cannot label: ``again`` is then low whatever the masks.
+    # A half cannot label what it does not see: ``again`` is then low whatever the masks.
     if found.alone > 0.25:
         return f"too few views: {found.alone:.0%} of the labelled points are seen by one half of the views alone"
     again, named = float(np.nanmean(found.again)), float(np.nanmean(found.named))

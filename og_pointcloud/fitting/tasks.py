@@ -22,13 +22,13 @@ from og_pointcloud.kernels import use_threads
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-SHARE_OF_LIMIT = 0.6
+DASK_MEMORY_SHARE = 0.6
 """Share of a Dask worker's memory limit that its tasks take: at 0.8 Dask pauses the worker, at 0.95 it kills it."""
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-LEAST_BYTES = 10**9
+MIN_WORKER_BYTES = 10**9
 """A worker of this machine has at least this much memory; where there is not enough, there are fewer workers."""
-PATIENCE_S = 20
+CONNECT_TIMEOUT_S = 20
 """How long a scheduler may take to answer, seconds."""
 
 
@@ -51,8 +51,8 @@ def cores_here() -> int:
 
 
 def share_here(otherwise: Share) -> Share:
-    """What a task may take where it runs: in a Dask worker one thread, and the same part of the worker's memory as each
-    of its threads; elsewhere what it was given."""
+    """What a task may take where it runs: in a Dask worker one thread and that thread's part of the worker's memory;
+    elsewhere what it was given."""
     # A process that has not imported distributed is no Dask worker; importing it takes long.
     if "distributed" not in sys.modules:
         return otherwise
@@ -63,19 +63,19 @@ def share_here(otherwise: Share) -> Share:
     except ValueError:  # this process is no worker
         return otherwise
     limit = worker.memory_manager.memory_limit
-    return Share(1, int(SHARE_OF_LIMIT * limit / worker.state.nthreads) if limit else None)
+    return Share(1, int(DASK_MEMORY_SHARE * limit / worker.state.nthreads) if limit else None)
 
 
 def run_tasks(
     executor: Executor | None, journal: Journal, function: Callable[[Item], Result], items: Sequence[Item], name: str
 ) -> list[Result]:
-    """The function's value of each item, in their order: made here, one after another, or by an executor's workers."""
+    """The function's value for each item, in order: computed here, one after another, or by an executor's workers."""
     if executor is None:
         return [function(item) for item in journal.steps(items, name)]
     futures = [executor.submit(_with_share, function, item) for item in items]
     try:
         return [future.result() for future in journal.steps(futures, name)]
-    except BaseException:  # Ctrl-C too: what has not begun shall not begin
+    except BaseException:  # Ctrl-C too: cancel what has not begun
         for future in futures:
             future.cancel()
         raise
@@ -89,8 +89,8 @@ def _with_share(function: Callable[[Item], Result], item: Item) -> Result:
 
 
 def _begin() -> None:
-    """Run in each worker: it ends when its parent was killed, and with it its locks. Else it would wait for tasks for
-    good. Where it has no task, Ctrl-C ends it without a word."""
+    """Run in each worker: ends it, and releases its locks, when its parent was killed. Otherwise it would wait for
+    tasks forever. Without a task, Ctrl-C ends it silently."""
 
     def watch() -> None:
         if (parent := parent_process()) is not None:
@@ -98,7 +98,7 @@ def _begin() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as of what a shell starts in the background
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored in what a shell starts in the background
         signal.signal(signal.SIGINT, _end)
     _hold_interrupts(False)
 
@@ -108,7 +108,7 @@ def _end(*_: object) -> None:
 
 
 def _hold_interrupts(held: bool) -> None:
-    """Holds Ctrl-C back from this thread, and from processes that it starts from then on, or lets it through."""
+    """Blocks Ctrl-C in this thread, and in processes that it starts from then on, or unblocks it."""
     if hasattr(signal, "pthread_sigmask"):  # not on Windows
         from multiprocessing import resource_tracker
 
@@ -117,7 +117,7 @@ def _hold_interrupts(held: bool) -> None:
 
 
 def _interruptible(fn: Callable[..., Result], *args: Any, **kwargs: Any) -> Result:
-    """A task in a worker: Ctrl-C raises KeyboardInterrupt in it, so that it puts in order what it has begun."""
+    """A task in a worker: Ctrl-C raises KeyboardInterrupt in it, so that it can clean up."""
     if signal.getsignal(signal.SIGINT) is not _end:
         return fn(*args, **kwargs)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -137,7 +137,7 @@ class LocalWorkers(ThreadPoolExecutor):
 
     def __init__(self, tasks: int) -> None:
         """tasks: how many there will be; there are as many processes at most, and as cores."""
-        workers = max(1, min(tasks, cores_here(), free_memory() // 2 // LEAST_BYTES))
+        workers = max(1, min(tasks, cores_here(), free_memory() // 2 // MIN_WORKER_BYTES))
         # Python, as it starts, would print where Ctrl-C met it: until `_begin` it is held back.
         super().__init__(workers, initializer=_hold_interrupts, initargs=(True,))
         self.share, self._process_of = Share.of_machine(workers), threading.local()
@@ -174,7 +174,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     with naming_extra("distributed", "cluster"):
         from distributed import Client
     try:
-        client = Client(address, timeout=PATIENCE_S)
+        client = Client(address, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
         raise OgPointcloudError(
             f"no scheduler answers at '{address}' ({error!s:.100}); expected the address that `dask scheduler` prints, "

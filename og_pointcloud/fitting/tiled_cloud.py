@@ -18,11 +18,10 @@ from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
-MARGIN = 32.0
-"""How far a tile looks over its borders, in spacings of its sparser points: all that decides about a point lies nearer.
-"""
-PROBES = 2_000
-"""About how many points of a tile tell its spacing, from which its margin is computed."""
+MARGIN_SPACINGS = 32.0
+"""Margin around a tile, in spacings of its sparser points: all that decides about a point lies within it."""
+SPACING_SAMPLE_POINTS = 2_000
+"""Approximate number of points that a tile's spacing, and so its margin, is computed from."""
 
 Rows = NDArray[np.integer]
 
@@ -43,10 +42,10 @@ class Tiles:
 
 
 def split(xyz: NDArray[np.float32], most: int) -> Tiles:
-    """As few tiles of equally many points as hold at most ``most`` each, where points do not coincide.
+    """The fewest tiles of equally many points, at most ``most`` each unless points coincide.
 
-    A part with more is cut across its longest side, measured by the middle 90 % of its points as strays are no extent.
-    So tiles are compact, small where points are dense, and never empty.
+    A part with more is cut across its longest side, measured over the middle 90 % of its points to ignore strays. So
+    tiles are compact, small where points are dense, and never empty.
     """
     leaves: list[Rows] = []
 
@@ -83,14 +82,14 @@ class TiledCloud:
 
     @classmethod
     def cut(cls, points: Points, most: int, settings: FitSettings, work: WorkFolder) -> TiledCloud:
-        """Tiles of at most so many points, and what lies about them."""
-        key = fingerprint(points.xyz, points.rgb, settings, most, MARGIN)
+        """Tiles of at most ``most`` points, and the points within their margins."""
+        key = fingerprint(points.xyz, points.rgb, settings, most, MARGIN_SPACINGS)
 
         def arrays() -> list[NDArray[Any]]:
             tiles = split(points.xyz, most)
             ordered = points.take(tiles.order)
             parts = [tiles.part(tile) for tile in range(len(tiles))]
-            margins = [MARGIN * _sparse_spacing(ordered.xyz[part]) for part in parts]
+            margins = [MARGIN_SPACINGS * _sparse_spacing(ordered.xyz[part]) for part in parts]
             members = [_within(ordered.xyz, part, margin) for part, margin in zip(parts, margins, strict=True)]
             # A file holds a flat list of arrays: members of all tiles in one, colors empty where there are none.
             ends, rgb = np.cumsum([0, *map(len, members)]), ordered.rgb
@@ -114,11 +113,11 @@ class TiledCloud:
 
     @cached_property
     def drawn_spacing(self) -> NDArray[np.float32]:
-        """(n,) float32, as of `geometry.drawn_spacing`."""
+        """(n,) float32, as `geometry.drawn_spacing`."""
         return self.work.array("spacing", self.key, vanished)[1]
 
     def inner(self, tile: int) -> slice:
-        """Which of a tile's members are its own points and not of its margin: these lie in one stretch."""
+        """The slice of a tile's members that are its own points, not its margin's."""
         part = self.tiles.part(tile)
         first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
         return slice(int(first), int(last))
@@ -140,7 +139,7 @@ def _opened(folder: Path, key: str) -> TiledCloud:
 
 
 def vanished() -> NoReturn:
-    """In place of arrays that another process should have made."""
+    """Called to make arrays that another process should have made already: raises."""
     raise OgPointcloudError(
         "a file of the work folder is gone or damaged, or a worker cannot see it; expected one folder that all workers "
         "share: name such a work folder, or set TMPDIR to one"
@@ -149,9 +148,9 @@ def vanished() -> NoReturn:
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
     """The spacing that 95 % of the points do not exceed, by a sample of them."""
-    # Built fast rather than asked fast: few points are looked up. The first neighbor is the point itself.
+    # Fast to build rather than to query: few points are looked up. The first neighbor is the point itself.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(xyz[:: 1 + len(xyz) // PROBES], k=[2, 3, 4])
+    distance, _ = tree.query(xyz[:: 1 + len(xyz) // SPACING_SAMPLE_POINTS], k=[2, 3, 4])
     known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points
     spacing = np.nanmean(known, axis=1) if np.isfinite(known).any() else np.zeros(1)
     return float(np.quantile(spacing, 0.95))

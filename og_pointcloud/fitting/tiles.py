@@ -1,19 +1,19 @@
 """Clouds beyond memory: one fit, tile by tile.
 
-What outgrows memory is the work per point: neighbors, splats, and what every view shows of every point. What an
-instance is does not: masks are joined by how they overlap, and a sample of the points says that. So nothing is
-labelled tile by tile and sewn together afterwards:
+What outgrows memory is the work per point: neighbors, splats, and what every view shows of every point. What forms an
+instance does not: masks are joined by their overlaps, which a sample of the points measures. So nothing is labelled
+tile by tile and sewn together afterwards:
 
-    split       tiles of equally many points, cut across the longest side; a tile looks a margin over its borders
+    split       tiles of equally many points, cut across the longest side; a tile includes a margin around its borders
     spacing     tile by tile
-    views       each is rendered once, with all that is in it, whatever tile it lies in: what stands in front hides what
-                is behind. Points finer than its pixels are thinned. What it shows goes to a file, in order of tiles
+    views       each is rendered once, with the points of all tiles in it: what stands in front hides what is behind.
+                Points finer than its pixels are thinned. What it shows goes to a file, in order of tiles
     instances   masks are grouped once, by a sample of all points, and groups that the views contradict dismissed once
     points      tile by tile: the state of each, from all views that see it and from its neighbors
     evidence    features, areas and parts of the instances, from sums over the tiles
 
 An object that crosses ten tiles is one instance because its masks are one group. No border can contradict another, and
-neither the order nor the place of the tiles shows in the result, but for what happens farther away than a margin.
+the result does not depend on the order or place of the tiles, except for effects from beyond a margin.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.fitting.colors import DIFFERENCES
+from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
-from og_pointcloud.fitting.membership import SceneVotes, assign_points, settled_points
+from og_pointcloud.fitting.membership import SceneVotes, assign_and_mark_spanning, assign_points
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.see_through import without_see_through
 from og_pointcloud.fitting.seen_colors import (
-    NO_COLOR,
-    believed,
+    NO_DIFFERENCE,
     differences,
     sight_ratios,
     warn_of_faults,
+    with_color_evidence,
     with_photograph,
 )
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
@@ -67,43 +67,42 @@ from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
 SAMPLE_STEP = 50
-"""Masks are grouped by at least one in so many points, even where that is more than a fit of the whole would sample."""
-FINEST_PX = 0.35
+"""Masks are grouped by at least one in this many points, even if that is more than a fit of the whole would sample."""
+MIN_SPACING_PX = 0.35
 """Points closer together than this in an image are thinned to it. On a street of 600,000 points 0.2 % of the labels
 then differ, 1.4 % at 0.5 and 17 % at 1, where a point no longer has a splat of its own in any image."""
-MOST_SPLATS = 4_000_000
-"""A view that would draw more than this is thinned further; drawing takes about 300 bytes a splat."""
-CHOICE_POINTS = 1_000_000
-"""The size of the splats is chosen on so many points, spread over the cloud."""
-LEAST_TILE, LARGEST_TILE = 125_000, 2_000_000
-"""Points of a tile where memory decides, in steps of twice as many, so that an interrupted fit finds the same tiles
-although the free memory is never the same. Smaller tiles are mostly margin, larger ones save no time."""
-TILE_BYTES = 1_500
-"""Bytes that a tile takes at its peak, per point."""
-FIT_BYTES = 1_000
-"""Bytes that one fit of a whole cloud takes, per point."""
-CLOUD_BYTES = 120
-"""Bytes that every point takes, whatever the tiles: positions, colors, spacings, ids, order."""
+MAX_SPLATS = 4_000_000
+"""A view that would draw more splats than this is thinned further; drawing takes about 300 bytes a splat."""
+SCALE_SAMPLE_POINTS = 1_000_000
+"""The size of the splats is chosen on at most this many points, spread over the cloud."""
+MIN_TILE_POINTS, MAX_TILE_POINTS = 125_000, 2_000_000
+"""Points of a tile if memory decides, in powers of two, so that an interrupted fit finds the same tiles although the
+free memory is never the same. Smaller tiles are mostly margin, larger ones save no time."""
+POINT_TILE_BYTES = 1_500
+"""Peak memory of a tile, in bytes per point."""
+POINT_FIT_BYTES = 1_000
+"""Memory of a fit of a whole cloud, in bytes per point."""
+POINT_CLOUD_BYTES = 120
+"""Memory of the cloud whatever the tiles, in bytes per point: positions, colors, spacings, ids, order."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Rows = NDArray[np.integer]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
-"""What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure.
-M + 2: exposure through holes. M + 3: 1 + the difference of its color from its pixel's (seen_colors.py)."""
+"""What a view with M masks shows of a point. Row < M: weight in that mask. M: weight in none. M + 1: exposure. M + 2:
+exposure through holes. M + 3: 1 + the distance of its color from its pixel's (seen_colors.py)."""
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
-    """Whether a fit in tiles is asked for, or all points at once would take more memory than allowed and tiles would
-    help."""
+    """Whether a fit in tiles is requested, or all points at once would take too much memory and tiles would help."""
     if settings.tile_points is not None:
         return True
     points = len(scene.points)
     return (
         LABELLERS[settings.mode] is grouping
-        and points > LEAST_TILE
-        and points * FIT_BYTES > memory_left(settings.memory)
+        and points > MIN_TILE_POINTS
+        and points * POINT_FIT_BYTES > memory_left(settings.memory)
     )
 
 
@@ -139,9 +138,9 @@ def fit_tiles(
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
-        look = partial(_look_at, cloud, drawing, settings)
-        looked = run(look, scene.views, "visibility")
-        shown = _all_shown(scene, cloud, looked, journal)
+        render = partial(_render, cloud, drawing, settings)
+        rendered = run(render, scene.views, "visibility")
+        shown = _all_shown(scene, cloud, rendered, journal)
     with journal.stage("grouping"):
         grouped = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
@@ -155,28 +154,28 @@ def fit_tiles(
 
 
 def _memory(points: int, settings: FitSettings, executor: Executor | None) -> int:
-    """Bytes that a fit may still take, here and in a worker."""
+    """Bytes that a fit may still take, in this process and in a worker."""
     # In a worker the points are mapped, not held: they do not count against its share.
     left = memory_left(settings.memory)
     if executor is None or (share := executor.submit(share_here, Share()).result().memory) is None:
         return left
-    return min(left, share + points * CLOUD_BYTES)
+    return min(left, share + points * POINT_CLOUD_BYTES)
 
 
 def _points_per_tile(points: int, left: int) -> int:
-    """Points of a tile for a fit that may take ``left`` bytes: LEAST_TILE times a power of two."""
-    fitting = (left - points * CLOUD_BYTES) // TILE_BYTES
-    if fitting < LEAST_TILE:
+    """Points of a tile for a fit that may take ``left`` bytes: MIN_TILE_POINTS times a power of two."""
+    fitting = (left - points * POINT_CLOUD_BYTES) // POINT_TILE_BYTES
+    if fitting < MIN_TILE_POINTS:
         raise OgPointcloudError(
-            f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of {LEAST_TILE:,} "
-            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: give it more memory, or thin "
-            "the cloud"
+            f"{points:,} points take {points * POINT_CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of "
+            f"{MIN_TILE_POINTS:,} {MIN_TILE_POINTS * POINT_TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: "
+            "give it more memory, or thin the cloud"
         )
-    return min(LEAST_TILE << (fitting // LEAST_TILE).bit_length() - 1, LARGEST_TILE)
+    return min(MIN_TILE_POINTS << (fitting // MIN_TILE_POINTS).bit_length() - 1, MAX_TILE_POINTS)
 
 
 def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
-    """(2, points of the tile) their spacing, and the one that they are drawn by."""
+    """(2, points of the tile) their spacing, and the spacing that they are drawn by."""
     around, members = cloud.neighbors(tile, settings.geometry), cloud.members[tile]
     return np.stack([around.spacing, drawn_spacing(cloud.points.xyz[members], around)])[:, cloud.inner(tile)]
 
@@ -186,15 +185,15 @@ def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class _Drawing:
-    """How points are drawn, the same in every tile. scale: of their splats, in spacings. near, typical: depth of the
-    near plane and the cloud's typical spacing, scene units."""
+    """How points are drawn, the same in every tile. scale: of their splats, in spacings. near: depth of the near plane.
+    typical: typical spacing of the cloud. Both in scene units."""
 
     scale: float
     near: float
     typical: float
 
     def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32], opacity: float) -> Gaussians:
-        """Splats of some points, each ``larger`` times as large as it would be."""
+        """Splats of some points, each enlarged by the factor ``larger``."""
         return isotropic(cloud.points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, opacity)
 
 
@@ -202,14 +201,14 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
     """The size of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, (view.camera for view in views)), float(np.median(cloud.spacing))
-    few, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
-    if len(points) > CHOICE_POINTS:
-        journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
-        few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
-        around = neighborhood(few.xyz, geometry)
-        spacing, drawn = around.spacing, drawn_spacing(few.xyz, around)
+    sample, spacing, drawn = points, cloud.spacing, cloud.drawn_spacing
+    if len(points) > SCALE_SAMPLE_POINTS:
+        journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - SCALE_SAMPLE_POINTS / len(points))
+        sample = points.take(sample_of_points(points.xyz, SCALE_SAMPLE_POINTS))
+        around = neighborhood(sample.xyz, geometry)
+        spacing, drawn = around.spacing, drawn_spacing(sample.xyz, around)
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
-    choice = choose_scale(few, drawn, thickness, views, near, settings, journal)
+    choice = choose_scale(sample, drawn, thickness, views, near, settings, journal)
     note_scale(choice, journal)
     return _Drawing(choice.scale, near, typical)
 
@@ -229,8 +228,8 @@ class _Shown:
     sight_ratios: NDArray[np.float32]
 
     def table(self, cloud: TiledCloud, rows: NDArray[np.integer]) -> MaskTable:
-        """The mask table of some points, given in ascending order: of photographs, not of the views cut from them."""
-        # place: the column of each point, -1 for others. Entries are read of those tiles alone that have such points.
+        """The mask table of some points, in ascending order, for photographs, not the views cut from them."""
+        # place: the column of each point, -1 for others. Only entries of tiles with such points are read.
         place = np.full(len(cloud.points), -1, np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         tiles = np.flatnonzero(np.diff(np.searchsorted(rows, cloud.tiles.start)))
@@ -244,41 +243,41 @@ class _Shown:
             stacks.append(_stacked(part, int(masks[view]), len(rows)))
         *of_views, difference = zip(*stacks, strict=True)
         weights, outside, exposure, through = (csr_array(vstack(blocks, format="csr")) for blocks in of_views)
-        no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
+        no_pixels = np.zeros(len(self.mask_view), np.int32)  # needed only to find what lies behind an object
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
         table = MaskTable(weights, outside, exposure, *masks_of_views, doubted=through)
-        return self.photographs.joined(believed(table, np.concatenate(difference), self.sight_ratios))
+        return self.photographs.joined(with_color_evidence(table, np.concatenate(difference), self.sight_ratios))
 
 
 def _stacked(
     entries: Entries, masks: int, points: int
 ) -> tuple[csr_array, csr_array, csr_array, csr_array, NDArray[np.uint16]]:
-    """Of one view: weights (masks, n), and (1, n) outside, exposure and that through holes; and of each entry of the
-    exposure the difference of color."""
+    """Of one view: weights (masks, n); (1, n) outside, exposure and exposure through holes; and the color difference of
+    each entry of the exposure."""
     matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 4, points))
-    outside, exposure, through, apart = (csr_array(matrix[row : row + 1]) for row in range(masks, masks + 4))
-    # Every exposure has its difference, of the same points in the same order; or none has, without a photograph.
-    difference = apart.data - 1 if apart.nnz else np.full(exposure.nnz, NO_COLOR)
+    outside, exposure, through, differences = (csr_array(matrix[row : row + 1]) for row in range(masks, masks + 4))
+    # Every exposure has a difference, in the same order; without a photograph none has.
+    difference = differences.data - 1 if differences.nnz else np.full(exposure.nnz, NO_DIFFERENCE)
     return csr_array(matrix[:masks]), outside, exposure, through, difference.astype(np.uint16)
 
 
-def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
+def _all_shown(scene: Scene, cloud: TiledCloud, rendered: Sequence[_RenderedView], journal: Journal) -> _Shown:
     """What the views show, all in the work folder. SceneError where no view shows a point, or no mask does."""
-    if found := sum(view.was_there for view in looked):
+    if found := sum(view.was_there for view in rendered):
         folder = "" if cloud.work.folder is None else cloud.work.folder.name
         journal.leave_out(LeftOut.RENDERING, count=found, folder=folder)
-    for view in looked:
+    for view in rendered:
         cloud.work.adopt("view", view.key)
     masks = [view.mask_features for view in scene.views if view.mask_count]
-    require_sight(sum(int(view.first[-1]) for view in looked), sum(view.masked for view in looked), scene)
-    drawn, inside = np.sum([view.drawn for view in looked], axis=0).tolist()
+    require_sight(sum(int(view.first[-1]) for view in rendered), sum(view.masked for view in rendered), scene)
+    drawn, inside = np.sum([view.drawn for view in rendered], axis=0).tolist()
     if drawn < inside:
         share = 1 - drawn / inside
-        journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
-    warn_of_faults([view.fault for view in looked], journal)
-    mask_view = np.repeat(np.arange(len(looked), dtype=np.int32), [view.mask_count for view in scene.views])
-    first = np.array([view.first for view in looked])
-    keys = tuple(view.key for view in looked)
+        journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=MIN_SPACING_PX, most=MAX_SPLATS)
+    warn_of_faults([view.fault for view in rendered], journal)
+    mask_view = np.repeat(np.arange(len(rendered), dtype=np.int32), [view.mask_count for view in scene.views])
+    first = np.array([view.first for view in rendered])
+    keys = tuple(view.key for view in rendered)
     return _Shown(
         keys,
         first,
@@ -286,15 +285,15 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
         np.concatenate(masks),
         stacked_tracks([(view.mask_tracks, view.mask_count) for view in scene.views]),
         Photographs.of(scene.views),
-        sight_ratios(np.sum([view.colors for view in looked], axis=0)),
+        sight_ratios(np.sum([view.colors for view in rendered], axis=0)),
     )
 
 
 @dataclass(frozen=True)
-class _LookedAt:
+class _RenderedView:
     """A view in the work folder. first: (tiles + 1,), as in `_Shown`. masked: how many of its entries are in masks.
     drawn: how many points were drawn, and how many there are in the image. colors: as `differences` counts them.
-    was_there: since an earlier run. fault: of its photograph, as of `with_photograph`."""
+    was_there: from an earlier run. fault: of its photograph, from `with_photograph`."""
 
     key: str
     first: Rows
@@ -305,18 +304,18 @@ class _LookedAt:
     fault: str
 
 
-def _look_at(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _LookedAt:
+def _render(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _RenderedView:
     """Render a view, or find it in the work folder; its entries stay there."""
     ids = view.mask_map()
     unread = replace(view, masks=ids, image=None if cloud.points.rgb is None else view.image)
     view, fault = with_photograph(unread)
-    drawn_as = cloud.key, drawing, FINEST_PX, MOST_SPLATS
+    drawn_as = cloud.key, drawing, MIN_SPACING_PX, MAX_SPLATS
     key = fingerprint(*drawn_as, view.name, view.image, view_fingerprint(view, ids))
     was_there = cloud.work.has("view", key)
     entries, drawn, colors = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
     first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
     masked = int(np.count_nonzero(entries["row"] < view.mask_count))
-    return _LookedAt(key, first, masked, drawn, colors, was_there, fault)
+    return _RenderedView(key, first, masked, drawn, colors, was_there, fault)
 
 
 def _entries(
@@ -324,10 +323,10 @@ def _entries(
 ) -> tuple[Entries, NDArray[np.int64], NDArray[np.float64]]:
     """What one view shows, sorted by point; how many points were drawn, and how many there are in the image; and how
     often colors of points and pixels differ so far (`differences`)."""
-    rows, larger, inside = _worth_drawing(view, cloud, drawing)
+    rows, larger, inside = _points_to_draw(view, cloud, drawing)
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
-        return np.zeros(0, ENTRY), counts, np.zeros((2, DIFFERENCES))
+        return np.zeros(0, ENTRY), counts, np.zeros((2, COLOR_DIFFERENCE_BINS))
     splats = drawing.splats(cloud, rows, larger, settings.geometry.opacity)
     thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
     table = mask_table(splats, [view], drawing.near, thickness, by_sight=True)
@@ -336,8 +335,8 @@ def _entries(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
     exposure = front.exposure
-    off, colors = differences(cloud.points.take(rows), view, drawing.near, exposure.indices, exposure.data)
-    difference = csr_array((1 + off.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape)
+    distance, colors = differences(cloud.points.take(rows), view, drawing.near, exposure.indices, exposure.data)
+    difference = csr_array((1 + distance.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape)
     # Blocks of rows, as ENTRY numbers them: masks, outside, exposure, exposure through holes, differences of color.
     masks = view.mask_count
     blocks = [(front.weights, 0), (front.outside, masks), (exposure, masks + 1)]
@@ -353,17 +352,17 @@ def _entries(
     return entries[np.argsort(entries["point"], kind="stable")], counts, colors
 
 
-def _worth_drawing(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
-    """The points in an image that are drawn, how much larger than they are, and how many there are in it.
+def _points_to_draw(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
+    """The points of an image that are drawn, the factors that enlarge them, and the number of points in the image.
 
-    Points that lie FINEST_PX apart or more are all drawn. Of those closer together some are, drawn by chance so that
-    these lie that far apart; as much larger, they cover what all of them did.
+    Points at least MIN_SPACING_PX apart are all drawn. Closer ones are sampled to lie that far apart, and
+    enlarged to cover what all of them did.
     """
     parts = [_in_image(view.camera, cloud, cloud.tiles.part(tile), drawing) for tile in range(len(cloud.tiles))]
     rows, spacing_px = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    # A point is drawn with the chance that leaves a surface's points ``finest`` apart: by the square, as areas go.
-    finest = FINEST_PX
-    while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
+    # A point's probability leaves a surface's points ``finest`` apart: squared, as areas scale.
+    finest = MIN_SPACING_PX
+    while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MAX_SPLATS:
         finest *= 1.2
     drawn = chance_of_place(cloud.points.xyz[rows], view.name) < part
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
@@ -395,8 +394,8 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
 
 @dataclass(frozen=True)
 class _Grouped:
-    """What is decided for all tiles. groups: of masks, without those that the scene's views contradict. looks: theirs.
-    scene: what all votes say."""
+    """What is decided for all tiles. groups: of masks, without those that the scene's views contradict. looks: of the
+    groups. scene: what all votes say."""
 
     groups: MaskGroups
     looks: Looks
@@ -413,10 +412,10 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     around = neighborhood(cloud.points.xyz[sample], settings.geometry)
     rgb = cloud.points.rgb
     rgb = None if rgb is None else rgb[sample]
-    groups, judged = settled_points(table, votes, groups, around, settings, rgb)
+    groups, judged = assign_and_mark_spanning(table, votes, groups, around, settings, rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
-    # Groups of which the sample shows no sure point have rate 0: of these the tiles know more.
+    # Groups without a sure point in the sample have rate 0: the tiles know more about these.
     dismissed = judged.dismissed & (judged.detection_rate > 0)
     if dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
@@ -428,7 +427,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
 
 @dataclass(frozen=True)
 class _Decided:
-    """What is known of a tile's inner points. ids, certainty: as of `Membership`, but ids are of looks. in_masks:
+    """What is known of a tile's inner points. ids, certainty: as in `Membership`, but ids are looks. in_masks:
     (masks, looks), outside: (views, looks), sparse, what shows of each look's points in each mask, and outside."""
 
     ids: NDArray[np.int32]
@@ -448,7 +447,7 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     rgb = None if rgb is None else rgb[cloud.members[tile]]
     state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.scene)
     ids = by_look(votes, state.instance_ids, looks)
-    # Points of the margin helped to decide; they are another tile's own, and counted there.
+    # Points of the margin helped to decide; they belong to another tile, and are counted there.
     inner = cloud.inner(tile)
     inner_ids = np.full(len(ids), -1, np.int32)
     inner_ids[inner] = ids[inner]
@@ -474,7 +473,7 @@ def _instances(
 def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, decided: Sequence[_Decided]) -> MaskTable:
     """A mask table in which the first point of every instance stands for all its points.
 
-    What is asked of a table once the points have their ids are sums over the points of an instance: here they are.
+    Once points have their ids, only sums over the points of an instance are read from a table: these are the sums.
     """
     first = np.zeros(len(used), np.int64)
     labelled = np.flatnonzero(ids >= 0)[::-1]  # from the last to the first, which is written last and stays

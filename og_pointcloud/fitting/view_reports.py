@@ -1,24 +1,24 @@
-"""Which state each point is likeliest in, by what every view is known to report of each state.
+"""How likely each point is in each state, given what every view is known to report of each state.
 
 Views do not only miss things: one shows the book as shelf, another the two halves of a sofa as one, a third puts the
-wall behind the lamp into the lamp's mask. What a view says of a point then depends on what the point is of, and how is
-seen on all its other points: a view that calls the whole book "shelf" tells nothing of book and shelf, and its votes
-for the shelf should not count against the book. So views are treated as observers of whom none is right throughout
-(Dawid and Skene, 1979). A state is an instance, or background. With
+wall behind the lamp into the lamp's mask. So a report about a point is judged by what the view reports of other points
+of the same thing: a view that calls the whole book "shelf" cannot tell book from shelf, and its votes for the shelf
+should not count against the book. Views are therefore treated as observers none of which is always right (Dawid and
+Skene, 1979). A state is an instance, or background. With
 
-    c_v(k, r)   how often view v, of what it sees of state k, reports r: a mask of some instance, or none
-    p_v(g)      how far view v sees point g: its vote (`view_votes`), as far as the point is seen openly at all
+    c_v(k, r)   the share of what view v sees of state k that it reports as r: a mask of some instance, or none
+    p_v(g)      the probability that view v sees point g: its vote (`view_votes`) times the point's visibility
 
-view v, which reports r of point g, makes "g is in state k" likely by
+the likelihood of "g is in state k", where view v reports r of point g, is
 
-    p_v(g) c_v(k, r) + (1 - p_v(g)) HIDDEN
+    p_v(g) c_v(k, r) + (1 - p_v(g)) HIDDEN_REPORT_PROBABILITY
 
-as what stands before a hidden point may be anything. A mask that spans several things is a report of its own, of which
-no state expects anything: a view that gives it tells that the point is of one of the things that lie in it. The
-logarithms are added up over views, but count as ENOUGH independent views at most: views that look alike err alike.
-Points adjoin others, of which they are the likelier of one thing the more their colors say so (colors.py); each hears
-how likely its neighbors are in each state (mean field). What views report is counted on points whose state is clear
-without it, and anew on the states that this makes likely.
+because anything may stand in front of a hidden point. A mask that spans several things is a report of its own, which is
+not the expected one of any state: it says that the point belongs to one of the things in the mask. Log-likelihoods are
+summed over views, but count as MAX_INDEPENDENT_VIEWS independent views at most: views that look alike err alike.
+Adjoining points are the likelier to share a state the more alike their colors are (colors.py); each is influenced by
+the state probabilities of its neighbors (mean field). The reports are first counted on points whose state is clear
+without them, then again on the resulting state probabilities (EM).
 """
 
 from __future__ import annotations
@@ -33,132 +33,137 @@ from og_pointcloud.fitting.view_votes import VotesOfPoints
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 
-HIDDEN = 0.5
-"""Chance of any report about a point that the view does not see."""
-LEAST = 0.03
+HIDDEN_REPORT_PROBABILITY = 0.5
+"""Probability of any report about a point that the view does not see."""
+MIN_REPORT_PROBABILITY = 0.03
 """No report is less likely than this: any view may err anywhere."""
-ENOUGH = 3.0
-"""Views whose words add up; of more, the mean counts as that of so many."""
-EXPECTED = 10.0
-"""Points as which it counts, before any is looked at, that a view shows an instance in its own masks of it, and
-background, and what it has no mask of, in none."""
-UNSEEN = 2.0
-"""What it costs an instance, in the logarithm of its likelihood, that no view has a mask of it on the point."""
-MORE_LIKELY = 0.2
-"""What background has in that logarithm before any view is asked: a wrong name is worse than none."""
+MAX_INDEPENDENT_VIEWS = 3.0
+"""Log-likelihoods of up to this many views add up; more views count as this many times their mean."""
+PRIOR_COUNT = 10.0
+"""Pseudo-count, in points, of the report that a view without errors gives: its own mask of an instance, and no mask for
+background and for instances that it has no mask of."""
+NO_MASK_LOG_PENALTY = 2.0
+"""Subtracted from the log-likelihood of an instance where no view has a mask of it on the point."""
+BACKGROUND_LOG_PRIOR = 0.2
+"""Log-prior of background over any instance: a wrong name is worse than none."""
 SMOOTHNESS = 0.6
-"""What a sure neighbor adds to the logarithm of its state, times the ratio of its color (colors.py), less APART."""
-APART = 0.5
-"""A neighbor is not heard whose color is only so many times likelier within one thing than between two: the less colors
-say in a scene, the less its points follow their neighbors."""
-ROUNDS = 5
-"""Times that points hear their neighbors."""
-COUNTED = 2
-"""Times that it is counted what views report."""
+"""What a neighbor that is sure of its state adds to the logarithm of that state, times its color ratio (colors.py) less
+MIN_COLOR_RATIO."""
+MIN_COLOR_RATIO = 0.5
+"""Neighbors have no influence at or below this color ratio (how much likelier their color difference is within one
+thing than between two): the less colors say in a scene, the less its points follow their neighbors."""
+MEAN_FIELD_ROUNDS = 5
+"""Rounds in which points are updated by their neighbors."""
+EM_ROUNDS = 2
+"""Rounds in which reports are counted and states updated."""
 
-_EXACT = float(1 << 24)
-"""In steps of its reciprocal the sums of what views report are exact in float64: the points' order does not matter."""
+_FIXED_POINT_SCALE = float(1 << 24)
+"""Counts are rounded to multiples of its reciprocal, so that their float64 sums are exact and do not depend on the
+order of points."""
 
 
 @dataclass(frozen=True)
 class ViewReports:
-    """c_v(k, r) of a scene, whose numbers are its groups, its masks that span several, which are reports but no states,
-    and, as the last, background. column: (views, numbers) int32, the column of a report in view v, -1 where v has no
-    mask of it; background's is "no mask", the last. seat: (views, numbers) int32, the row of a state, -1 where v sees
-    no point that may be in it. first: (views + 1,) int64, where each view's table begins in ``chance``: (rows times
-    columns of all,) float32. spanned: (spanning masks, groups) bool, whether clear points of a group lie in the mask.
-    """
+    """c_v(k, r) of a scene. States and reports share their numbers: groups, then masks that span several groups (which
+    are reports only), then background. report_column: (views, numbers) int32, the column of a report in view v's table,
+    -1 where v has no such mask; background's is the last, "no mask". state_row: (views, numbers) int32, the row of a
+    state, -1 where v sees no point that may be in it. table_start: (views + 1,) int64, where each view's table begins
+    in ``probability``: (rows times columns of all,) float32. spanned: (spanning masks, groups) bool, whether clear
+    points of a group lie in the mask."""
 
-    column: NDArray[np.int32]
-    seat: NDArray[np.int32]
-    first: NDArray[np.int64]
-    chance: NDArray[np.float32]
+    report_column: NDArray[np.int32]
+    state_row: NDArray[np.int32]
+    table_start: NDArray[np.int64]
+    probability: NDArray[np.float32]
     spanned: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class LikelyStates:
-    """The states that each point may be in: state[start[g] : start[g + 1]], groups, and background as the last number;
-    none where no view sees it. They are background, the groups in whose masks it lies, those that a mask in which it
-    lies spans, and those of points that adjoin it. masked: (all,) bool, not of the last alone. likely: (all,) float64,
-    of sum 1 a point. groups: how many. background: its number."""
+    """The candidate states of each point: state[start[g] : start[g + 1]], groups and, last, the background number; none
+    where no view sees the point. Candidates are the groups of the masks that the point lies in, the groups that
+    spanning masks around it span, the groups of adjoining points, and background. in_mask: (all,) bool, False for those
+    of adjoining points only. probability: (all,) float64, sums to 1 for each point. group_count: number of groups.
+    background: its number."""
 
     start: NDArray[np.int64]
     state: NDArray[np.int32]
-    masked: NDArray[np.bool_]
-    likely: NDArray[np.float64]
-    groups: int
+    in_mask: NDArray[np.bool_]
+    probability: NDArray[np.float64]
+    group_count: int
     background: int
 
     @property
     def ids(self) -> NDArray[np.int32]:
-        """(n,) the likeliest group of each point (ties: the lowest) or BACKGROUND; UNOBSERVED where it has no state."""
-        return _likeliest(self.start, self.state, self.likely, self.background)
+        """(n,) each point's most probable group (ties: the lowest) or BACKGROUND; UNOBSERVED without candidates."""
+        return _most_probable(self.start, self.state, self.probability, self.background)
 
-    def of(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(n,) how likely each point is in the state of ``ids``; 0 where that is none it may be in."""
-        return _likely_in(self.start, self.state, self.likely, np.where(ids == BACKGROUND, self.background, ids))
+    def probability_of(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(n,) the probability that each point is in its state of ``ids``; 0 where that is not a candidate."""
+        states = np.where(ids == BACKGROUND, self.background, ids)
+        return _probability_in(self.start, self.state, self.probability, states)
 
     def expected_iou(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(groups,) the IoU that each group's points in ``ids`` have with all that is of it, as far as states are as
-        likely as found; 0 where nothing is."""
-        count, grouped = self.groups, ids >= 0
-        of_group = np.bincount(self.state, self.likely, self.background + 1)[:count]
-        right = np.bincount(ids[grouped], self.of(ids)[grouped], count)
+        """(groups,) the expected IoU of each group's points in ``ids`` with its true points under these probabilities;
+        0 where it has no points."""
+        count, grouped = self.group_count, ids >= 0
+        of_group = np.bincount(self.state, self.probability, self.background + 1)[:count]
+        right = np.bincount(ids[grouped], self.probability_of(ids)[grouped], count)
         either = np.bincount(ids[grouped], minlength=count) + of_group - right
         return np.divide(right, either, out=np.zeros(count), where=either > 0)
 
 
 def likely_states(
-    of_points: VotesOfPoints,
-    of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
+    point_votes: VotesOfPoints,
+    mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     size: tuple[int, int],
     clear: NDArray[np.int32],
-    asked: NDArray[np.int32],
-    openly: NDArray[np.float32],
+    best_group: NDArray[np.int32],
+    visibility: NDArray[np.float32],
     around: Neighborhood,
     weights: NDArray[np.float32],
     reports: ViewReports | None = None,
 ) -> tuple[LikelyStates, ViewReports]:
-    """How likely points are in each state, and what views report.
+    """The probability of each candidate state of each point, and what views report.
 
-    of_masks: the group of each mask, -1 none, which says nothing, or, of one that spans several, a number of its own
-    after the groups; and its view. size: views and groups. clear: (n,) the states of points that are clear, UNOBSERVED
-    of others. asked: (n,) the group that each point is asked of, -1 none: points that adjoin it may be of that group
-    too. openly: (n,) in [0, 1], what counts of votes on each point. weights: of neighbors, as of `neighbor_weights`.
-    reports: of the scene that these points are a part of; None: they are all of it, and it is counted on them.
+    mask_reports: for each mask what it reports, a group, -1 for nothing, or, if it spans several groups, a number of
+    its own after the groups; and its view. size: numbers of views and groups. clear: (n,) the state of each clear
+    point, UNOBSERVED for others. best_group: (n,) the group with the most votes on each point, -1 none; it is a
+    candidate for adjoining points too. visibility: (n,) in [0, 1], scales the votes on each point. weights: of
+    neighbors (`neighbor_weights`). reports: of the whole scene that these points are part of; None: counted on them.
     """
-    spanned = _spanned(of_points, of_masks[0], size[1], clear) if reports is None else reports.spanned
-    found = _candidates(of_points, of_masks[0], spanned, clear, asked, around)
+    spanned = _spanned_groups(point_votes, mask_reports[0], size[1], clear) if reports is None else reports.spanned
+    candidates = _candidates(point_votes, mask_reports[0], spanned, clear, best_group, around)
 
-    def settled_by(reports: ViewReports) -> LikelyStates:
-        return _settled(_evidence(of_points, of_masks, found, openly, reports), found, around, weights, openly)
+    def posterior(reports: ViewReports) -> LikelyStates:  # E step
+        unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports)
+        return _mean_field(unary, candidates, around, weights, visibility)
 
     if reports is not None:
-        return settled_by(reports), reports
-    reports, states = _nothing_reported(of_points, of_masks, size[0], spanned, found), found
-    for _ in range(COUNTED):
-        reports = _learned(of_points, of_masks, states, openly, reports)
-        states = settled_by(reports)
+        return posterior(reports), reports
+    reports, states = _empty_tables(point_votes, mask_reports, size[0], spanned, candidates), candidates
+    for _ in range(EM_ROUNDS):
+        reports = _estimated_reports(point_votes, mask_reports, states, visibility, reports)
+        states = posterior(reports)
     return states, reports
 
 
-# States that points may be in ----------------------------------------------------------------------------------------
+# Candidate states ----------------------------------------------------------------------------------------------------
 
 
-def _spanned(
-    of_points: VotesOfPoints, group: NDArray[np.int32], groups: int, clear: NDArray[np.int32]
+def _spanned_groups(
+    point_votes: VotesOfPoints, group: NDArray[np.int32], groups: int, clear: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
     """`ViewReports.spanned`."""
     spanned, low = np.zeros((max(int(group.max(initial=-1)) + 1 - groups, 0), groups), np.bool_), 0
-    for some in of_points if len(spanned) else ():
-        low = _mark_spanned(*some()[0], low, group, clear, spanned)
+    for chunk in point_votes if len(spanned) else ():
+        low = _mark_spanned(*chunk()[0], low, group, clear, spanned)
     return spanned
 
 
 @njit(cache=True)
 def _mark_spanned(mask_start, of_mask, low, group, clear, spanned):  # noqa: ANN001, ANN202
-    """Marks what masks span of the points from ``low`` on. Returns the point after the last."""
+    """Marks the groups that masks span, by the points from ``low`` on. Returns the point after the last."""
     groups = spanned.shape[1]
     for i in range(len(mask_start) - 1):
         for e in range(mask_start[i], mask_start[i + 1]):
@@ -168,40 +173,41 @@ def _mark_spanned(mask_start, of_mask, low, group, clear, spanned):  # noqa: ANN
 
 
 def _candidates(
-    of_points: VotesOfPoints,
+    point_votes: VotesOfPoints,
     group: NDArray[np.int32],
     spanned: NDArray[np.bool_],
     clear: NDArray[np.int32],
-    asked: NDArray[np.int32],
+    best_group: NDArray[np.int32],
     around: Neighborhood,
 ) -> LikelyStates:
-    """Those of each point; a clear one is likely in its state alone, and others in none. group: (masks,)."""
+    """The candidates of all points, with probability 1 for the state of a clear point, else 0. group: (masks,)."""
     (spanning, groups), low, found = spanned.shape, 0, []
     background = groups + spanning
     clear = np.where(clear == BACKGROUND, background, clear)  # as candidates are numbered
-    spans = np.concatenate([[0], np.cumsum(spanned.sum(axis=1))]), np.nonzero(spanned)[1].astype(np.int32)
-    near = asked, around.index, around.adjoining
-    for some in of_points:
-        masks, views = some()
-        found.append(_of_each_point(masks, views[0], low, group, groups, spans, near))
+    span = np.concatenate([[0], np.cumsum(spanned.sum(axis=1))]), np.nonzero(spanned)[1].astype(np.int32)
+    adjacency = best_group, around.index, around.adjoining
+    for chunk in point_votes:
+        masks, views = chunk()
+        found.append(_candidates_of_points(masks, views[0], low, group, groups, span, adjacency))
         low += len(masks[0]) - 1
     counts, state, masked = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    start, likely = np.concatenate([[0], np.cumsum(counts)]), (state == np.repeat(clear, counts)).astype(np.float64)
-    return LikelyStates(start, state, masked, likely, groups, background)
+    probability = (state == np.repeat(clear, counts)).astype(np.float64)
+    return LikelyStates(np.concatenate([[0], np.cumsum(counts)]), state, masked, probability, groups, background)
 
 
 @njit(cache=True)
-def _of_each_point(masks, view_start, low, group, groups, spans, near):  # noqa: ANN001, ANN202
-    """(n,) how many candidates each of the points from ``low`` on has; and (all,) which, and which of them it lies in
-    a mask of. spans: (start, groups) of spanning masks. near: as of `likely_states`, with neighbors."""
-    (mask_start, of_mask), (first, within), (asked, neighbors, adjoining) = masks, spans, near
-    n, most = len(mask_start) - 1, 0
+def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency):  # noqa: ANN001, ANN202
+    """Of the points from ``low`` on: (n,) their numbers of candidates; (all,) the candidates; and (all,) whether the
+    point lies in a mask of each. span: (start, groups) of spanning masks. adjacency: (best group, neighbors, adjoining)
+    of all points."""
+    (mask_start, of_mask), (span_start, span_group), (best_group, neighbors, adjoining) = masks, span, adjacency
+    n, capacity = len(mask_start) - 1, 0
     for e in range(len(of_mask)):
         k = group[of_mask[e].row] - groups
-        most += 1 if k < 0 else first[k + 1] - first[k]
+        capacity += 1 if k < 0 else span_start[k + 1] - span_start[k]
     count = np.zeros(n, np.int64)
-    # A point has background, and at most one for each mask, or each that a mask spans, and each neighbor.
-    found = np.empty(n * (neighbors.shape[1] + 1) + most, np.int32)
+    # Background, and at most one for each mask (or each group that it spans) and each neighbor.
+    found = np.empty(n * (neighbors.shape[1] + 1) + capacity, np.int32)
     masked = np.empty(len(found), np.bool_)
     end = 0
     for i in range(n):
@@ -210,26 +216,26 @@ def _of_each_point(masks, view_start, low, group, groups, spans, near):  # noqa:
         begin, g = end, low + i
         for e in range(mask_start[i], mask_start[i + 1]):
             k = group[of_mask[e].row]
-            if 0 <= k < groups and not _holds(found, begin, end, k):
+            if 0 <= k < groups and not _contains(found, begin, end, k):
                 found[end], masked[end] = k, True
                 end += 1
-            for s in range(first[k - groups], first[k - groups + 1]) if k >= groups else range(0):
-                if not _holds(found, begin, end, within[s]):
-                    found[end], masked[end] = within[s], True
+            for s in range(span_start[k - groups], span_start[k - groups + 1]) if k >= groups else range(0):
+                if not _contains(found, begin, end, span_group[s]):
+                    found[end], masked[end] = span_group[s], True
                     end += 1
         for j in range(neighbors.shape[1]):
-            k = asked[neighbors[g, j]]
-            if adjoining[g, j] and k >= 0 and not _holds(found, begin, end, k):
+            k = best_group[neighbors[g, j]]
+            if adjoining[g, j] and k >= 0 and not _contains(found, begin, end, k):
                 found[end], masked[end] = k, False
                 end += 1
-        found[end], masked[end] = groups + len(first) - 1, True
+        found[end], masked[end] = groups + len(span_start) - 1, True
         end += 1
         count[i] = end - begin
     return count, found[:end].copy(), masked[:end].copy()
 
 
 @njit(cache=True)
-def _holds(found, begin, end, k):  # noqa: ANN001, ANN202
+def _contains(found, begin, end, k):  # noqa: ANN001, ANN202
     for c in range(begin, end):  # noqa: SIM110 - numba has no generators
         if found[c] == k:
             return True
@@ -239,30 +245,30 @@ def _holds(found, begin, end, k):  # noqa: ANN001, ANN202
 # What views report ---------------------------------------------------------------------------------------------------
 
 
-def _nothing_reported(
-    of_points: VotesOfPoints,
-    of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
+def _empty_tables(
+    point_votes: VotesOfPoints,
+    mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     views: int,
     spanned: NDArray[np.bool_],
-    found: LikelyStates,
+    candidates: LikelyStates,
 ) -> ViewReports:
-    """The tables of all views, empty."""
-    group, mask_view = of_masks
-    shown = np.zeros((views, found.background + 1), np.bool_)
+    """The tables of all views, filled with zeros."""
+    group, mask_view = mask_reports
+    shown = np.zeros((views, candidates.background + 1), np.bool_)
     shown[mask_view[group >= 0], group[group >= 0]] = True
-    shown[:, found.background] = True
-    column = np.where(shown, np.cumsum(shown, axis=1) - 1, -1).astype(np.int32)
+    shown[:, candidates.background] = True
+    report_column = np.where(shown, np.cumsum(shown, axis=1) - 1, -1).astype(np.int32)
     seen, low = np.zeros(shown.shape, np.bool_), 0
-    for some in of_points:
-        low = _mark_seen(*some()[1], low, found.start, found.state, seen)
-    seat = np.where(seen, np.cumsum(seen, axis=1) - 1, -1).astype(np.int32)
-    first = np.concatenate([[0], np.cumsum(seen.sum(axis=1) * shown.sum(axis=1))]).astype(np.int64)
-    return ViewReports(column, seat, first, np.zeros(first[-1], np.float32), spanned)
+    for chunk in point_votes:
+        low = _mark_seen(*chunk()[1], low, candidates.start, candidates.state, seen)
+    state_row = np.where(seen, np.cumsum(seen, axis=1) - 1, -1).astype(np.int32)
+    table_start = np.concatenate([[0], np.cumsum(seen.sum(axis=1) * shown.sum(axis=1))]).astype(np.int64)
+    return ViewReports(report_column, state_row, table_start, np.zeros(table_start[-1], np.float32), spanned)
 
 
 @njit(cache=True)
 def _mark_seen(view_start, of_view, low, start, state, seen):  # noqa: ANN001, ANN202
-    """Marks in (views, states) of what a view sees candidates. Returns the point after the last."""
+    """Marks in (views, states) the candidates of the points that each view sees. Returns the point after the last."""
     for i in range(len(view_start) - 1):
         for e in range(view_start[i], view_start[i + 1]):
             for c in range(start[low + i], start[low + i + 1]):
@@ -270,211 +276,212 @@ def _mark_seen(view_start, of_view, low, start, state, seen):  # noqa: ANN001, A
     return low + len(view_start) - 1
 
 
-def _learned(
-    of_points: VotesOfPoints,
-    of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
-    found: LikelyStates,
-    openly: NDArray[np.float32],
+def _estimated_reports(
+    point_votes: VotesOfPoints,
+    mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
+    candidates: LikelyStates,
+    visibility: NDArray[np.float32],
     tables: ViewReports,
 ) -> ViewReports:
-    """What each view reports of the points in each state, these being as likely in it as found."""
-    column, seat, first = table = tables.column, tables.seat, tables.first
-    counted, low = np.zeros(first[-1]), 0
-    for some in of_points:
-        low = _count(*some(), low, of_masks, (found.start, found.state, found.likely), openly, table, counted)
-    chance = np.empty(first[-1], np.float32)
-    _share(column, seat, first, counted, chance)
-    return replace(tables, chance=chance)
+    """What each view reports of each state, counted on points by their state probabilities (M step)."""
+    report_column, state_row, table_start = table = tables.report_column, tables.state_row, tables.table_start
+    states = candidates.start, candidates.state, candidates.probability
+    counts, low = np.zeros(table_start[-1]), 0
+    for chunk in point_votes:
+        low = _add_counts(*chunk(), low, mask_reports, states, visibility, table, counts)
+    probability = np.empty(table_start[-1], np.float32)
+    _normalize(report_column, state_row, table_start, counts, probability)
+    return replace(tables, probability=probability)
 
 
 @njit(cache=True)
-def _report(of_mask, e, end, group, mask_view, view, vote):  # noqa: ANN001, ANN202
-    """What a view with this vote on a point says of it: where its masks end, from e on, the part of its vote that
-    counts, and what of that is for "no mask". What lies in masks without a group says nothing."""
-    grouped, lost = 0.0, 0.0
+def _view_report(of_mask, e, end, group, mask_view, view, vote):  # noqa: ANN001, ANN202
+    """What a view with this vote reports of a point: the end of its masks, which begin at e; the part of its vote that
+    counts; and the part of that for "no mask". Votes in masks without a group do not count."""
+    grouped, ungrouped = 0.0, 0.0
     while e < end and mask_view[of_mask[e].row] <= view:
         if group[of_mask[e].row] >= 0:
             grouped += of_mask[e].vote
         else:
-            lost += of_mask[e].vote
+            ungrouped += of_mask[e].vote
         e += 1
-    counts = max(vote - lost, grouped)
-    return e, counts, counts - grouped
+    used = max(vote - ungrouped, grouped)
+    return e, used, used - grouped
 
 
 @njit(cache=True)
-def _count(masks, views, low, of_masks, candidates, openly, table, counted):  # noqa: ANN001, ANN202
-    """Adds to ``counted`` what views report of the points from ``low`` on, by the square of how far they see these.
-    Returns the point after the last."""
-    (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, of_masks
-    (start, state, likely), (column, seat, first) = candidates, table
-    background = column.shape[1] - 1
+def _add_counts(masks, views, low, mask_reports, candidates, visibility, table, counts):  # noqa: ANN001, ANN202
+    """Adds to ``counts`` what views report of the points from ``low`` on, weighted by visibility squared. Returns the
+    point after the last."""
+    (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, mask_reports
+    (start, state, probability), (report_column, state_row, table_start) = candidates, table
+    background = report_column.shape[1] - 1
     for i in range(len(mask_start) - 1):
         g, e = low + i, mask_start[i]
         for v in range(view_start[i], view_start[i + 1]):
-            view, here = of_view[v].row, e
-            e, counts, none = _report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
-            last = column[view, background]
+            view, first_mask = of_view[v].row, e
+            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
+            no_mask_column = report_column[view, background]
             for c in range(start[g], start[g + 1]):
-                if likely[c] == 0:
+                if probability[c] == 0:
                     continue
-                weight = _EXACT * likely[c] * counts * openly[g] ** 2
-                row = first[view] + seat[view, state[c]] * (last + 1)
-                for m in range(here, e):
+                weight = _FIXED_POINT_SCALE * probability[c] * used_vote * visibility[g] ** 2
+                row = table_start[view] + state_row[view, state[c]] * (no_mask_column + 1)
+                for m in range(first_mask, e):
                     k = group[of_mask[m].row]
                     if k >= 0:
-                        counted[row + column[view, k]] += np.rint(weight * of_mask[m].vote) / _EXACT
-                counted[row + last] += np.rint(weight * none) / _EXACT
+                        counts[row + report_column[view, k]] += np.rint(weight * of_mask[m].vote) / _FIXED_POINT_SCALE
+                counts[row + no_mask_column] += np.rint(weight * no_mask) / _FIXED_POINT_SCALE
     return low + len(mask_start) - 1
 
 
 @njit(cache=True)
-def _share(column, seat, first, counted, chance):  # noqa: ANN001, ANN202
-    """Writes to ``chance`` the part of each report in all of a state, EXPECTED among them."""
-    background = column.shape[1] - 1
-    for view in range(len(column)):
-        width = column[view, background] + 1
-        for k in range(seat.shape[1]):
-            if seat[view, k] < 0:
+def _normalize(report_column, state_row, table_start, counts, probability):  # noqa: ANN001, ANN202
+    """Writes to ``probability`` the share of each report among all of a state, PRIOR_COUNT included."""
+    background = report_column.shape[1] - 1
+    for view in range(len(report_column)):
+        width = report_column[view, background] + 1
+        for k in range(state_row.shape[1]):
+            if state_row[view, k] < 0:
                 continue
-            row = first[view] + seat[view, k] * width
-            total = counted[row : row + width].sum() + EXPECTED
+            row = table_start[view] + state_row[view, k] * width
+            total = counts[row : row + width].sum() + PRIOR_COUNT
             for r in range(width):
-                expected = EXPECTED if r == _expected(column[view, k], width) else 0.0
-                chance[row + r] = _at_least((counted[row + r] + expected) / total)
+                prior = PRIOR_COUNT if r == _ideal_column(report_column[view, k], width) else 0.0
+                probability[row + r] = _with_floor((counts[row + r] + prior) / total)
 
 
 @njit(cache=True)
-def _expected(column, width):  # noqa: ANN001, ANN202
-    """The column of what a view that errs nowhere reports of a state."""
+def _ideal_column(column, width):  # noqa: ANN001, ANN202
+    """The column of the report that a view without errors gives of a state."""
     return column if column >= 0 else width - 1
 
 
 @njit(cache=True)
-def _at_least(chance):  # noqa: ANN001, ANN202
-    return (1 - LEAST) * chance + LEAST
+def _with_floor(probability):  # noqa: ANN001, ANN202
+    return (1 - MIN_REPORT_PROBABILITY) * probability + MIN_REPORT_PROBABILITY
 
 
-# Points --------------------------------------------------------------------------------------------------------------
+# State probabilities -------------------------------------------------------------------------------------------------
 
 
-def _evidence(
-    of_points: VotesOfPoints,
-    of_masks: tuple[NDArray[np.int32], NDArray[np.int32]],
-    found: LikelyStates,
-    openly: NDArray[np.float32],
+def _unary_potentials(
+    point_votes: VotesOfPoints,
+    mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
+    candidates: LikelyStates,
+    visibility: NDArray[np.float32],
     reports: ViewReports,
 ) -> NDArray[np.float64]:
-    """(candidates,) the logarithm of how likely views make each, but for what all of a point have in common."""
-    evidence, low = np.where(found.masked, 0, -UNSEEN), 0
-    evidence[found.state == found.background] = MORE_LIKELY
-    table = reports.column, reports.seat, reports.first, reports.chance
-    for some in of_points:
-        votes = some()
-        _add_evidence(*votes, low, of_masks, (found.start, found.state), openly, table, evidence)
+    """(candidates,) log-prior plus log-likelihood of each, up to a constant for each point."""
+    unary, low = np.where(candidates.in_mask, 0, -NO_MASK_LOG_PENALTY), 0
+    unary[candidates.state == candidates.background] = BACKGROUND_LOG_PRIOR
+    table = reports.report_column, reports.state_row, reports.table_start, reports.probability
+    for chunk in point_votes:
+        votes = chunk()
+        _add_log_likelihood(*votes, low, mask_reports, (candidates.start, candidates.state), visibility, table, unary)
         low += len(votes[0][0]) - 1
-    return evidence
+    return unary
 
 
 @njit(cache=True, parallel=True)
-def _add_evidence(masks, views, low, of_masks, candidates, openly, reports, evidence):  # noqa: ANN001, ANN202
-    """Adds to the evidence what views report of the points from ``low`` on."""
-    (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, of_masks
-    (start, state), (column, seat, first, chance) = candidates, reports
-    background = column.shape[1] - 1
+def _add_log_likelihood(masks, views, low, mask_reports, candidates, visibility, reports, unary):  # noqa: ANN001, ANN202
+    """Adds to ``unary`` the log-likelihood of what views report of the points from ``low`` on."""
+    (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, mask_reports
+    (start, state), (report_column, state_row, table_start, probability) = candidates, reports
+    background = report_column.shape[1] - 1
     for i in prange(len(mask_start) - 1):
         g, e = low + i, mask_start[i]
         begin, end = start[g], start[g + 1]
         if end - begin < 2:
-            continue  # nothing is to be told apart
-        seen, likely = 0.0, np.zeros(end - begin)
+            continue  # one candidate at most: nothing to decide
+        total_seen, log_likelihood = 0.0, np.zeros(end - begin)
         for v in range(view_start[i], view_start[i + 1]):
-            view, here = of_view[v].row, e
-            e, counts, none = _report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
-            if counts <= 0:
+            view, first_mask = of_view[v].row, e
+            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
+            if used_vote <= 0:
                 continue
-            sees, width = counts * openly[g], column[view, background] + 1
+            p_seen, width = used_vote * visibility[g], report_column[view, background] + 1
             for c in range(begin, end):
                 k, total = state[c], 0.0
-                for m in range(here, e + 1):
-                    # Last of all: in no mask.
-                    said, part, r = background, none, width - 1
+                for m in range(first_mask, e + 1):
+                    # The last one: in no mask.
+                    report, vote, col = background, no_mask, width - 1
                     if m < e:
-                        said, part = group[of_mask[m].row], of_mask[m].vote
-                        r = column[view, said] if said >= 0 else -1
-                    if said < 0 or part <= 0:
+                        report, vote = group[of_mask[m].row], of_mask[m].vote
+                        col = report_column[view, report] if report >= 0 else -1
+                    if report < 0 or vote <= 0:
                         continue
-                    if r < 0:  # a group of which the points that reports were counted on show nothing
-                        reported = _at_least(1.0 if k == said else 0.0)
-                    elif seat[view, k] >= 0:
-                        reported = chance[first[view] + seat[view, k] * width + r]
+                    if col < 0:  # a group unseen among the points that reports were counted on
+                        p_report = _with_floor(1.0 if k == report else 0.0)
+                    elif state_row[view, k] >= 0:
+                        p_report = probability[table_start[view] + state_row[view, k] * width + col]
                     else:
-                        reported = _at_least(1.0 if r == _expected(column[view, k], width) else 0.0)
-                    total += part / counts * np.log(sees * reported + (1 - sees) * HIDDEN)
-                likely[c - begin] += total
-            seen += sees
+                        p_report = _with_floor(1.0 if col == _ideal_column(report_column[view, k], width) else 0.0)
+                    total += vote / used_vote * np.log(p_seen * p_report + (1 - p_seen) * HIDDEN_REPORT_PROBABILITY)
+                log_likelihood[c - begin] += total
+            total_seen += p_seen
         for c in range(begin, end):
-            evidence[c] += likely[c - begin] / max(1.0, seen / ENOUGH)
+            unary[c] += log_likelihood[c - begin] / max(1.0, total_seen / MAX_INDEPENDENT_VIEWS)
 
 
-def _settled(
-    evidence: NDArray[np.float64],
-    found: LikelyStates,
+def _mean_field(
+    unary: NDArray[np.float64],
+    candidates: LikelyStates,
     around: Neighborhood,
     weights: NDArray[np.float32],
-    openly: NDArray[np.float32],
+    visibility: NDArray[np.float32],
 ) -> LikelyStates:
-    """How likely states are by their evidence, and once points have heard their neighbors ROUNDS times."""
-    likely = np.zeros_like(evidence)
-    for loudness in (0.0, *[SMOOTHNESS] * ROUNDS):  # at first no neighbor says anything
-        likely = _heard(found.start, found.state, evidence, likely, around.index, weights, openly, loudness)
-    return replace(found, likely=likely)
+    """State probabilities from the unary potentials, then MEAN_FIELD_ROUNDS updates by the neighbors."""
+    start, state, probability = candidates.start, candidates.state, np.zeros_like(unary)
+    for smoothness in (0.0, *[SMOOTHNESS] * MEAN_FIELD_ROUNDS):  # the first round is without neighbors
+        probability = _mean_field_round(start, state, unary, probability, around.index, weights, visibility, smoothness)
+    return replace(candidates, probability=probability)
 
 
 @njit(cache=True, parallel=True)
-def _heard(start, state, evidence, likely, neighbors, weights, openly, loudness):  # noqa: ANN001, ANN202
-    """(candidates,) how likely each is by its evidence and by how likely it was of the points that adjoin."""
-    heard = np.ones(len(likely))
+def _mean_field_round(start, state, unary, probability, neighbors, weights, visibility, smoothness):  # noqa: ANN001, ANN202
+    """(candidates,) the probability of each from its unary potential and the previous probabilities of neighbors."""
+    updated = np.ones(len(probability))
     for g in prange(len(start) - 1):
         begin, end = start[g], start[g + 1]
         if end - begin < 2:
             continue
-        value = evidence[begin:end].copy()
-        for j in range(neighbors.shape[1] if loudness > 0 else 0):
+        value = unary[begin:end].copy()
+        for j in range(neighbors.shape[1] if smoothness > 0 else 0):
             other = neighbors[g, j]
-            voice = loudness * max(weights[g, j] - APART, 0) * openly[other]
-            if voice == 0:
+            influence = smoothness * max(weights[g, j] - MIN_COLOR_RATIO, 0) * visibility[other]
+            if influence == 0:
                 continue
             for o in range(start[other], start[other + 1]):
                 for c in range(begin, end):
                     if state[c] == state[o]:
-                        value[c - begin] += voice * likely[o]
+                        value[c - begin] += influence * probability[o]
                         break
         value = np.exp(value - value.max())
-        heard[begin:end] = value / value.sum()
-    return heard
+        updated[begin:end] = value / value.sum()
+    return updated
 
 
 @njit(cache=True)
-def _likeliest(start, state, likely, background):  # noqa: ANN001, ANN202
+def _most_probable(start, state, probability, background):  # noqa: ANN001, ANN202
     """`LikelyStates.ids`."""
     ids = np.full(len(start) - 1, UNOBSERVED, np.int32)
     for g in range(len(ids)):
-        best, most = background, -1.0
+        best, highest = background, -1.0
         for c in range(start[g], start[g + 1]):
-            if likely[c] > most or (likely[c] == most and state[c] < best):
-                best, most = state[c], likely[c]
-        if most >= 0:
+            if probability[c] > highest or (probability[c] == highest and state[c] < best):
+                best, highest = state[c], probability[c]
+        if highest >= 0:
             ids[g] = BACKGROUND if best == background else best
     return ids
 
 
 @njit(cache=True)
-def _likely_in(start, state, likely, ids):  # noqa: ANN001, ANN202
+def _probability_in(start, state, probability, ids):  # noqa: ANN001, ANN202
     """`LikelyStates.of`, background by its number."""
     found = np.zeros(len(ids))
     for g in range(len(ids)):
         for c in range(start[g], start[g + 1]):
             if state[c] == ids[g]:
-                found[g] = likely[c]
+                found[g] = probability[c]
     return found

@@ -1,11 +1,11 @@
 """How each view votes on each point, and how much its vote counts.
 
-A view votes on every point it sees: so much of what shows of the point lies in this mask, so much outside. Its vote
-counts by how openly it sees the point: the part of the splat that reaches the camera (exposure), relative to the
+A view votes on every point it sees: how much of what it shows of the point lies in each mask, and how much outside. Its
+vote counts by how openly it sees the point: the part of the splat that reaches the camera (exposure), relative to the
 view that sees the point best, squared. So
 
-* what shines through a gap in front of a surface is not believed where another view looks at it openly: else a few
-  points in front would be outweighed by the many behind them, and a floor seen through a table be called table;
+* what shines through a gap in a surface does not count where another view sees it openly: otherwise the few points in
+  front would be outweighed by the many behind them, and a floor seen through a table would be labelled table;
 * a point inside a thick, noisy surface, which no view sees openly, is still decided, because all views see it alike;
 * near and far views count alike: pixels are not evidence.
 """
@@ -26,23 +26,23 @@ from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import njit
 
 OPENNESS_POWER = 2
-"""Exponent of the relative exposure. 1 believes too much of what shines through, 4 too little of thick surfaces."""
+"""Exponent of the relative exposure. 1 trusts too much of what shines through, 4 too little of thick surfaces."""
 
 ENTRIES_AT_ONCE = 1 << 26
-"""Entries of the votes that are sorted by point at once: half a gigabyte."""
+"""Votes that are sorted by point at once: half a gigabyte."""
 VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
-"""A vote on a point, and the mask or view whose it is: written and read together, they share a line of memory."""
+"""A vote on a point, and the mask or view that casts it: used together, they share a cache line."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
 """(start, votes): the votes on point g are votes[start[g] : start[g + 1]], rows ascending."""
 VotesOfPoints = Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]]
-"""Votes in masks, and all of views, of so many points at a time that they fit into memory, points ascending."""
+"""Votes in masks, and all votes of views, in chunks of ascending points that fit into memory."""
 
 
 @dataclass(frozen=True)
 class ViewVotes:
     """vote: (views, n) sparse float32 in (0, 1], how much the vote of each view counts on each point that it sees.
-    in_mask: (masks, n) sparse float32, the part of its view's vote that is for "in this mask". The masks' rows of a
-    view sum to at most its vote; the rest is for "in no mask". openness: (n,) float32, exposure of each point in the
+    in_mask: (masks, n) sparse float32, the part of its view's vote that is for "in this mask". The rows of a view's
+    masks sum to at most its vote; the rest is for "in no mask". openness: (n,) float32, exposure of each point in the
     view that sees it best, 0 where none does."""
 
     in_mask: csr_array
@@ -62,7 +62,7 @@ def view_votes(table: MaskTable) -> ViewVotes:
     vote, in_mask = scratch_like(exposure.data, np.float32), scratch_like(weights.data, np.float32)
     openness = _relative_exposure(exposure.indices, exposure.data, exposure.shape[1], vote)
     first_mask = np.searchsorted(table.mask_view, np.arange(exposure.shape[0] + 1))
-    _share_votes(
+    _split_votes(
         first_mask,
         (weights.indptr, weights.indices, weights.data),
         (outside.indptr, outside.indices, outside.data),
@@ -79,7 +79,7 @@ def view_votes(table: MaskTable) -> ViewVotes:
 
 @njit(cache=True)
 def _relative_exposure(index, exposure, n, vote):  # noqa: ANN001, ANN202
-    """Write to ``vote`` each exposure as a part of the point's best one, to OPENNESS_POWER. Returns the best, (n,)."""
+    """Writes to ``vote`` each exposure relative to the point's best, to OPENNESS_POWER. Returns the best, (n,)."""
     best = np.zeros(n, np.float32)
     for e in range(len(index)):
         best[index[e]] = max(best[index[e]], exposure[e])
@@ -89,8 +89,8 @@ def _relative_exposure(index, exposure, n, vote):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _share_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN001, ANN202
-    """Write to ``in_mask`` each mask weight as a part of what its view shows of the point, times the view's vote."""
+def _split_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN001, ANN202
+    """Writes to ``in_mask`` each mask weight as a share of what its view shows of the point, times the view's vote."""
     weight_start, weight_index, weight = weights
     outside_start, outside_index, outside_weight = outside
     vote_start, vote_index, vote = votes
@@ -108,13 +108,13 @@ def _share_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN0
             g = vote_index[e]
             factor[g] = vote[e] / seen[g]
             seen[g] = 0.0
-        # Whatever a mask shows its view has exposed: each factor read here was written just above.
+        # A view exposes all that its masks show: each factor read here was written just above.
         for e in range(first, last):
             in_mask[e] = weight[e] * factor[weight_index[e]]
 
 
 def votes_of_points(votes: ViewVotes) -> VotesOfPoints:
-    """The votes by point; kept where they are all in one part."""
+    """The votes by point; cached if they are all in one chunk."""
     in_mask, vote = votes.in_mask, votes.vote
     n, runs = in_mask.shape[1], 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
     bounds = [(n * run // runs, n * (run + 1) // runs) for run in range(runs)]
@@ -134,11 +134,11 @@ def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
         if low <= indices[e] < high:
             start[indices[e] - low + 1] += 1
     start = np.cumsum(start)
-    place, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
+    end, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
     for row in range(len(indptr) - 1):
         for e in range(indptr[row], indptr[row + 1]):
             if low <= indices[e] < high:
-                vote = votes[place[indices[e] - low]]
+                vote = votes[end[indices[e] - low]]
                 vote["row"], vote["vote"] = row, data[e]
-                place[indices[e] - low] += 1
+                end[indices[e] - low] += 1
     return start, votes

@@ -32,11 +32,11 @@ from og_pointcloud.formats.atomic import locked, replacing
 
 SUFFIX = ".kept.npy"
 """Ends the names of all files of a work folder, so that files of others are left alone."""
-ALIGNED = 64
-"""Arrays begin at multiples of so many bytes of a file. A .npy header is padded to the same, so that the numbers are
-aligned too."""
-BLOCK = 1 << 25
-"""Bytes of the blocks that held arrays are packed into: so large that the system gets each back when it is freed."""
+ALIGNMENT_BYTES = 64
+"""Arrays begin at multiples of this in a file. A .npy header is padded to the same, so that its numbers are aligned
+too."""
+BLOCK_BYTES = 1 << 25
+"""Size of the blocks that arrays in memory are packed into: large enough that a freed block returns to the system."""
 
 Arrays = tuple[NDArray[Any], ...]
 
@@ -64,7 +64,7 @@ def _of_code() -> blake2b:
 
 
 def kept_files(folder: Path, name: str = "") -> int:
-    """How many files an unfinished run has left in its work folder, of those whose names begin with ``name``."""
+    """How many files whose names begin with ``name`` an unfinished run has left in its work folder."""
     return len(list(folder.glob(f"{name}*{SUFFIX}")))
 
 
@@ -80,14 +80,14 @@ class WorkFolder:
         # Arrays held in memory, by the name of their file; None from when all is written at once.
         self._pending: dict[str, Arrays] | None = None
         self._bytes_pending, self._most_pending, self._pending_until = 0, 0.0, 0.0
-        self._sound: set[str] = set()  # files written or checked by this run: their checksum is not read again
+        self._verified: set[str] = set()  # files written or checked by this run: their checksum is not read again
         self._room = np.empty(0, np.uint8)  # what is left of the block that arrays are packed into
         self._guard, self._numbers = threading.Lock(), itertools.count()
 
     @classmethod
     @contextmanager
     def open(cls, folder: str | os.PathLike[str] | None) -> Iterator[WorkFolder]:
-        """For one run, which owns the folder meanwhile: another process that opens it gets an error.
+        """Opens the folder for one run, which owns it meanwhile: another process that opens it gets an error.
 
         A run that ends well removes its files, and the folder if nothing else is in it; one that is interrupted leaves
         them. folder None: a temporary one, made when it is needed and removed in any case.
@@ -111,7 +111,7 @@ class WorkFolder:
 
     def adopt(self, name: str, key: str) -> None:
         """Trust a file that another process of this run has written: it is neither checked nor counted as found."""
-        self._sound.add(f"{name}-{key}{SUFFIX}")
+        self._verified.add(f"{name}-{key}{SUFFIX}")
 
     def has(self, name: str, key: str) -> bool:
         """Whether there is a file of these arrays."""
@@ -170,12 +170,12 @@ class WorkFolder:
         return arrays
 
     def _packed(self, array: NDArray[Any]) -> NDArray[Any]:
-        """A copy in a block of memory that goes back to the system once all arrays in it are let go. Small pieces of
-        the heap do not go back, and a table put together from such pieces would be in memory twice."""
+        """A copy in a block of memory that returns to the system once all its arrays are freed. Small pieces of the
+        heap do not return, and a table assembled from such pieces would be in memory twice."""
         if array.nbytes > len(self._room):
-            self._room = np.empty(max(BLOCK, array.nbytes), np.uint8)  # arrays packed before keep the old block alive
+            self._room = np.empty(max(BLOCK_BYTES, array.nbytes), np.uint8)  # earlier arrays keep the old block alive
         copy = self._room[: array.nbytes].view(array.dtype).reshape(array.shape)
-        self._room = self._room[array.nbytes + -array.nbytes % ALIGNED :]
+        self._room = self._room[array.nbytes + -array.nbytes % ALIGNMENT_BYTES :]
         copy[...] = array
         return copy
 
@@ -207,7 +207,7 @@ class WorkFolder:
                 f"'{path}' cannot be written ({error.strerror}); expected room for {size:.1f} MB: give a work folder "
                 "on a larger disk, or, for a run without one, set TMPDIR to such a disk"
             ) from error
-        self._sound.add(label)
+        self._verified.add(label)
 
     def _read(self, label: str) -> Arrays | None:
         """The arrays of a file, mapped; None where there is none, or it is damaged."""
@@ -215,11 +215,11 @@ class WorkFolder:
         if folder is None:
             return None
         try:
-            arrays = _read_arrays(folder / label, label in self._sound)
+            arrays = _read_arrays(folder / label, label in self._verified)
         except (OSError, ValueError):  # no such file, or an empty one
             return None
-        if arrays is not None and label not in self._sound:  # of an earlier run
-            self._sound.add(label)
+        if arrays is not None and label not in self._verified:  # of an earlier run
+            self._verified.add(label)
             self.found += 1
         return arrays
 
@@ -236,21 +236,21 @@ class _Summed:
 
 
 def _write_arrays(file: IO[bytes], arrays: Arrays) -> None:
-    """One .npy after another, each from a multiple of ALIGNED bytes on, then the checksum of all before it."""
+    """One .npy after another, each at a multiple of ALIGNMENT_BYTES, then the checksum of all before it."""
     summed = _Summed(file)
     for array in arrays:
         np.lib.format.write_array(summed, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
-        summed.write(bytes(-summed.size % ALIGNED))
+        summed.write(bytes(-summed.size % ALIGNMENT_BYTES))
     file.write(summed.checksum.to_bytes(4, "little"))
 
 
-def _read_arrays(path: Path, is_sound: bool) -> Arrays | None:
-    """What `_write_arrays` wrote, mapped; None where the checksum is another, unless the file is known to be sound. One
-    map for all arrays of a file: a process may have only so many maps."""
+def _read_arrays(path: Path, is_verified: bool) -> Arrays | None:
+    """What `_write_arrays` wrote, mapped; None if the checksum differs, unless the file is already verified. One map
+    for all arrays of a file: the number of maps of a process is limited."""
     with path.open("rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         end = len(content) - 4
-        if not is_sound and zlib.crc32(memoryview(content)[: max(end, 0)]).to_bytes(4, "little") != content[end:]:
+        if not is_verified and zlib.crc32(memoryview(content)[: max(end, 0)]).to_bytes(4, "little") != content[end:]:
             return None
         arrays = []
         while file.tell() < end:
@@ -258,5 +258,5 @@ def _read_arrays(path: Path, is_sound: bool) -> Arrays | None:
             shape, _, dtype = np.lib.format.read_array_header_1_0(file)
             arrays.append(np.frombuffer(content, dtype, math.prod(shape), offset=file.tell()).reshape(shape))
             place = file.tell() + arrays[-1].nbytes
-            file.seek(place + -place % ALIGNED)
+            file.seek(place + -place % ALIGNMENT_BYTES)
     return tuple(arrays)
