@@ -24,9 +24,9 @@ UNKNOWN_SPACE = "unknown"
 """Feature space of vectors whose encoder nobody named: they are compared by width alone."""
 NO_EVIDENCE = -2.0
 """Cosine of an instance without a descriptor: below every true one."""
-LENGTHS = (1e-30, 1e30)
+LENGTH_LIMITS = (1e-30, 1e30)
 """Shortest and longest spacing or reach of a scene: their squares and ratios are still finite in float64."""
-FARTHEST = 1e15
+MAX_ORIGIN = 1e15
 """Largest coordinate of a scene's origin, in its unit: beyond, float64 has no digits left for the points."""
 MIN_BANK = 50
 """Fewest words of a bank: of fewer the standard deviation is too uncertain to measure evidence in."""
@@ -314,10 +314,12 @@ class LabelledCloud:
             )
         for name in ("spacing", "reach"):
             value = getattr(self, name)
-            if not LENGTHS[0] <= value <= LENGTHS[1]:
-                raise OgPointcloudError(f"{name} is {value}; expected a positive length, {LENGTHS[0]} to {LENGTHS[1]}")
-        if not (np.abs(self.origin) <= FARTHEST).all():
-            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {FARTHEST:g}")
+            if not LENGTH_LIMITS[0] <= value <= LENGTH_LIMITS[1]:
+                raise OgPointcloudError(
+                    f"{name} is {value}; expected a positive length, {LENGTH_LIMITS[0]} to {LENGTH_LIMITS[1]}"
+                )
+        if not (np.abs(self.origin) <= MAX_ORIGIN).all():
+            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {MAX_ORIGIN:g}")
         space = self.space  # refuses a name that is none
         if self.word_bank is not None:
             space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")

@@ -37,7 +37,7 @@ MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")
 ERRORS_ONLY = 3
 """Least severity that onnxruntime logs."""
-MOST_GRAPH_BYTES, LONGEST_RUN_S = 3 << 30, 120.0
+MAX_GRAPH_BYTES, MAX_RUN_S = 3 << 30, 120.0
 """Most memory for weights and all that is computed from them, and longest run, seconds; the largest text encoders take
 half of the one, and a second of the other."""
 STANDARD_DOMAINS = ("", "ai.onnx")
@@ -78,7 +78,7 @@ def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
     """A CPU session that leaves the cores idle between runs. model: a serialized ONNX graph.
 
     bounded: for a stranger's graph. Nothing is computed on opening, and all that such graphs compute shares
-    MOST_GRAPH_BYTES: what asks for more fails.
+    MAX_GRAPH_BYTES: what asks for more fails.
     """
     # Read on import, when it would otherwise write a device id and a usage database into the user's cache folder.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
@@ -102,13 +102,13 @@ def _bound_memory() -> None:
 
     kind, usual = (ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, ort.OrtMemType.DEFAULT)  # pyright: ignore
     place = ort.OrtMemoryInfo("Cpu", kind, 0, usual)  # pyright: ignore
-    ort.create_and_register_allocator(place, ort.OrtArenaCfg(MOST_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
+    ort.create_and_register_allocator(place, ort.OrtArenaCfg(MAX_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
 
 
 def run_bounded(
     session: InferenceSession, given: Mapping[str, NDArray[Any]], outputs: Sequence[str] | None = None
 ) -> list[Any]:
-    """The outputs that are named, computing only what they need; None: all. TimeoutError after LONGEST_RUN_S. That, or
+    """The outputs that are named, computing only what they need; None: all. TimeoutError after MAX_RUN_S. That, or
     Ctrl-C, stops the run between two nodes."""
     import onnxruntime
 
@@ -119,7 +119,7 @@ def run_bounded(
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(session.run, outputs, dict(given), options)
         try:
-            return list(answer.result(LONGEST_RUN_S))
+            return list(answer.result(MAX_RUN_S))
         except BaseException:
             options.terminate = True
             raise

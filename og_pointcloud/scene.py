@@ -24,15 +24,15 @@ FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
-SHORTEST_FOCAL = 1e-6
+MIN_FOCAL_SHARE = 1e-6
 """Focal length over the image's side: shorter ones see half of the world in every pixel."""
-LONGEST_SIDE = 1 << 17
+MAX_SIDE_PX = 1 << 17
 """Pixels; no camera has more."""
 NOT_SEEN = -2
 """In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
-FEW = 12
+MAX_VALUES_SHOWN = 12
 """Arrays and tuples of up to so many values are shown whole by a record's repr."""
-RIGID = 1e-2
+ROTATION_TOLERANCE = 1e-2
 """How far a rotation's rows may be from length one and from right angles, in any entry of R R' - 1."""
 UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much; it scales a Gaussian by its square, twice as much."""
@@ -52,9 +52,11 @@ def brief(self: Any) -> str:
 
 
 def _brief(value: Any) -> str:
-    if isinstance(value, np.ndarray) and value.size > FEW:
+    if isinstance(value, np.ndarray) and value.size > MAX_VALUES_SHOWN:
         return f"<{value.dtype} {value.shape}>"
-    if isinstance(value, dict) or (isinstance(value, tuple) and (len(value) > FEW or any(map(is_dataclass, value)))):
+    if isinstance(value, dict) or (
+        isinstance(value, tuple) and (len(value) > MAX_VALUES_SHOWN or any(map(is_dataclass, value)))
+    ):
         return f"<{len(value)}>"
     return "<read when asked for>" if callable(value) else repr(value)
 
@@ -119,23 +121,23 @@ class Camera:
         if not all(isinstance(number, Real) for number in numbers):
             raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers of pixels")
         error, determinant = rotation_error(pose[:3, :3])
-        if not error <= RIGID or determinant < 0:  # also where the error is NaN
+        if not error <= ROTATION_TOLERANCE or determinant < 0:  # also where the error is NaN
             raise SceneError(
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
         # Sizes come before focal lengths, which are held against them.
-        if not all(1 <= side <= LONGEST_SIDE and side == int(side) for side in (self.width, self.height)):
+        if not all(1 <= side <= MAX_SIDE_PX and side == int(side) for side in (self.width, self.height)):
             raise SceneError(
                 f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
-                f"most {LONGEST_SIDE} a side, in whole numbers: check w and h of the pose file"
+                f"most {MAX_SIDE_PX} a side, in whole numbers: check w and h of the pose file"
             )
         for name in ("width", "height"):
             object.__setattr__(self, name, int(getattr(self, name)))  # 64.0 is no shape
-        if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
+        if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < MIN_FOCAL_SHARE:
             raise SceneError(
                 f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, fx and fy > 0 "
-                f"by {SHORTEST_FOCAL:g} of the image's sides or more: check the camera model in the pose file"
+                f"by {MIN_FOCAL_SHARE:g} of the image's sides or more: check the camera model in the pose file"
             )
 
     def resized(self, width: int, height: int) -> Camera:

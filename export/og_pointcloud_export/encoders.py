@@ -58,7 +58,7 @@ PARITY_TEXTS = (
 PARITY_IMAGES = 4
 PARITY_PATCHES = (4, 7)
 """Rows and columns of patches of a further image, whose shape is not the one of training."""
-MOST_PATCHES = 1 << 10
+MAX_PATCHES_PER_SIDE = 1 << 10
 """Along a side of an image that a graph takes."""
 
 
@@ -151,7 +151,9 @@ def write_image_encoder(folder: Path, model: ImageModel, tower: Any, about: dict
         graph = tower
     else:
         patch = about["patch"]
-        sides = {axis: patch * torch.export.Dim(name, min=2, max=MOST_PATCHES) for axis, name in ((2, "h"), (3, "w"))}
+        sides = {
+            axis: patch * torch.export.Dim(name, min=2, max=MAX_PATCHES_PER_SIDE) for axis, name in ((2, "h"), (3, "w"))
+        }
         example = torch.zeros((2, 3, 3 * patch, 5 * patch))
         graph = _onnx_graph(tower, example, "pixels", ["image", "patches"], {0: torch.export.Dim("batch"), **sides})
     try:

@@ -32,9 +32,9 @@ from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
 from og_pointcloud_export.lookup_boxes import (
     CHILDREN,
     EDGE,
-    LONGEST_LIST,
-    NOTHING,
-    SHORT_LIST,
+    MAX_LIST_LENGTH,
+    MAX_SHARED_LIST_LENGTH,
+    NO_CHILD,
     SPLIT,
     TOO_FAR_CODE,
     answer_children,
@@ -46,13 +46,13 @@ CELL_PER_SPACING = 1.5
 """Size of a cell. Smaller ones need lists less often, but file size grows with the second to third power."""
 CELLS_PER_REACH = 3.0
 """A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
-BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
-NODES_PER_POINT, NODES_AT_LEAST = 1, 1 << 13
-LISTS_PER_POINT, LISTS_AT_LEAST = 4, 1 << 16
+BLOCKS_PER_POINT, MIN_BLOCK_BUDGET, MAX_BLOCK_BUDGET = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
+NODES_PER_POINT, MIN_NODE_BUDGET = 1, 1 << 13
+LISTS_PER_POINT, MIN_LIST_BUDGET = 4, 1 << 16
 """Most blocks, nodes and lists: they bound the table whatever the scene's extent; the rest is for the exact search."""
-MOST_BYTES = 1_800_000_000
+MAX_TABLE_BYTES = 1_800_000_000
 """Of all tables together, of which a graph holds less than 2^31 bytes: reached by clouds of 30 million points or so."""
-BRICKS_PER_AXIS = 1 << 13
+MAX_BRICKS_PER_AXIS = 1 << 13
 """So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
 BOXES_PER_CHUNK = 256
 """Answered at once, with about 4 MB of scratch."""
@@ -129,13 +129,13 @@ def _grid_frame(cloud: LabelledCloud) -> _Frame:
     cell_size = float(np.float32(max(CELL_PER_SPACING * cloud.spacing, cloud.reach / CELLS_PER_REACH)))
     if len(cloud) == 0:
         return _Frame(np.zeros(3), cell_size, (3, 3, 3), True)
-    allowed = min(max(BLOCKS_PER_POINT * len(cloud), BLOCKS_AT_LEAST), BLOCKS_AT_MOST)
+    allowed = min(max(BLOCKS_PER_POINT * len(cloud), MIN_BLOCK_BUDGET), MAX_BLOCK_BUDGET)
     border = cloud.reach + cell_size  # the cell more takes up all rounding
     # The least share of outliers, on each side of each axis, without which the grid is small enough.
     for left_out in (0.0, 1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.4):
         ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
         shape = np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * EDGE)) + 2
-        if np.ceil(shape / EDGE).prod() <= allowed and shape.max() <= BRICKS_PER_AXIS:
+        if np.ceil(shape / EDGE).prod() <= allowed and shape.max() <= MAX_BRICKS_PER_AXIS:
             break
     else:
         shape = np.full(3, 3.0)
@@ -197,8 +197,8 @@ class _Table:
         self._limits = (float(cloud.reach), surface_distance(float(cloud.spacing), float(cloud.reach)), self._codes)
         # The graph computes cell indices in float32: every box is inflated by what rounding can move a query.
         self._rounding = frame.cell_size * 4 * float(np.finfo(np.float32).eps) * max(frame.shape) * EDGE
-        self._nodes_allowed = max(NODES_PER_POINT * len(cloud), NODES_AT_LEAST)
-        self._lists_allowed = max(LISTS_PER_POINT * len(cloud), LISTS_AT_LEAST)
+        self._nodes_allowed = max(NODES_PER_POINT * len(cloud), MIN_NODE_BUDGET)
+        self._lists_allowed = max(LISTS_PER_POINT * len(cloud), MIN_LIST_BUDGET)
         shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + self._codes]], np.int32).repeat(CHILDREN, axis=1)
         self._nodes, self._first_child = [shared], [np.zeros(len(shared), np.int64)]
         self._child_length, self._child_start = [np.zeros(0, np.int32)], [np.zeros(0, np.int64)]
@@ -211,7 +211,7 @@ class _Table:
         those that are split."""
         edge = self._frame.brick_edge
         references, split_low = [np.zeros((0, CHILDREN), np.int64)], [np.zeros((0, 3))]
-        for boxes in self._answer(self._frame.low + blocks * (EDGE * edge), edge, SHORT_LIST, last=False):
+        for boxes in self._answer(self._frame.low + blocks * (EDGE * edge), edge, MAX_SHARED_LIST_LENGTH, last=False):
             certain = np.where(boxes.answers == TOO_FAR_CODE, _FAR, _OPEN)  # no brick lies in reach of one point
             unsplit = np.where(boxes.child >= 0, -1 - boxes.child, certain)
             references.append(np.where(boxes.row >= 0, boxes.row, unsplit))
@@ -221,7 +221,7 @@ class _Table:
     def nodes(self, low: NDArray[np.float64], size: float, *, last: bool) -> NDArray[np.float64]:
         """Add the nodes of boxes with these low corners and children of that size; low corners of those split again."""
         split_low = [np.zeros((0, 3))]
-        for boxes in self._answer(low, size, LONGEST_LIST, last=last):
+        for boxes in self._answer(low, size, MAX_LIST_LENGTH, last=last):
             child = boxes.child - boxes.first_child[:, None] + 2 * self._codes
             self._nodes.append(np.where(boxes.child >= 0, child, boxes.answers).astype(np.int32))
             self._first_child.append(boxes.first_child)
@@ -240,18 +240,18 @@ class _Table:
         for first in range(0, len(low), BOXES_PER_CHUNK):
             corners = low[first : first + BOXES_PER_CHUNK]
             answers, child, lengths = (np.empty((len(corners), CHILDREN), np.int32) for _ in range(3))
-            lists = np.empty((*child.shape, LONGEST_LIST), np.int32)
+            lists = np.empty((*child.shape, MAX_LIST_LENGTH), np.int32)
             level = (size, self._rounding, longest, last)
             answer_children(corners, level, self._limits, self._points, (answers, child, lengths, lists))
-            if self._bytes > MOST_BYTES:
+            if self._bytes > MAX_TABLE_BYTES:
                 self._nodes_allowed = self._lists_allowed = 0
             if self._lists_made >= self._lists_allowed:  # no more lists: what would have one is open
-                child[child != SPLIT], lengths[:] = NOTHING, 0
+                child[child != SPLIT], lengths[:] = NO_CHILD, 0
             split = child == SPLIT
             split &= self._rows_promised + np.cumsum(split).reshape(split.shape) <= self._nodes_allowed
-            child[(child == SPLIT) & ~split] = NOTHING
+            child[(child == SPLIT) & ~split] = NO_CHILD
             box, place = np.nonzero(split)
-            split_low = corners[box] + _PLACES[place] * size
+            split_low = corners[box] + _CHILD_OFFSETS[place] * size
             yield _Boxes(answers, *self._add_children(child, split, lengths, lists), split_low)
 
     def _add_children(
@@ -269,12 +269,12 @@ class _Table:
         exists = np.concatenate([listed, split], axis=1)
         self._child_length.append(np.concatenate([lengths, np.zeros_like(lengths)], axis=1)[exists])
         self._child_start.append(np.concatenate([list_start, row], axis=1)[exists])
-        self._candidates.append(lists[np.arange(LONGEST_LIST) < lengths[..., None]])
+        self._candidates.append(lists[np.arange(MAX_LIST_LENGTH) < lengths[..., None]])
         self._children_made += int(exists.sum())
         self._lists_made += int(listed.sum())
         self._rows_promised += int(split.sum())
         self._candidates_made += int(lengths.sum())
-        return first_child, np.where(child == NOTHING, -1, first_child[:, None] + in_box), row
+        return first_child, np.where(child == NO_CHILD, -1, first_child[:, None] + in_box), row
 
     def grid(self, blocks: NDArray[np.int64], references: NDArray[np.int64]) -> LookupGrid:
         """All that was added, with the references of the bricks in these blocks."""
@@ -284,7 +284,7 @@ class _Table:
         block_row = np.full(self._frame.blocks, _FAR, np.int64)
         if not self._frame.whole:  # the outermost bricks stand for points that lie beyond
             last = np.array(self._frame.shape) - 1
-            brick = blocks[:, None] * EDGE + _PLACES
+            brick = blocks[:, None] * EDGE + _CHILD_OFFSETS
             bricks[((brick == 0) | (brick == last)).any(axis=2)] = _OPEN
             block_row[:] = _OPEN
             block_row[tuple(slice(1, end // EDGE) for end in last)] = _FAR
@@ -317,7 +317,7 @@ class _Boxes:
     split_low: NDArray[np.float64]
 
 
-_PLACES = np.stack(np.unravel_index(np.arange(CHILDREN), (EDGE,) * 3), axis=1)
+_CHILD_OFFSETS = np.stack(np.unravel_index(np.arange(CHILDREN), (EDGE,) * 3), axis=1)
 """(64, 3): along each axis, the children of a box in C order."""
 
 

@@ -20,18 +20,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.bundle.format import BEYOND_REACH, NEAR_SURFACE, ON_SURFACE
 from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import naming_extra
-from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, LONGEST_LIST, SHORT_LIST, TOO_FAR_CODE
+from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, MAX_LIST_LENGTH, MAX_SHARED_LIST_LENGTH, TOO_FAR_CODE
 from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid
 
 with naming_extra("onnx", "fit"):
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
+LIST_LENGTHS = (MAX_SHARED_LIST_LENGTH, 20, MAX_LIST_LENGTH)
 """Candidates compared at once: the first number of every list, the next of lists that are longer, and so on."""
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
@@ -187,8 +187,8 @@ class _Lookup:
             graph.constant(f"candidate_{axis}", np.ascontiguousarray(xyz[:, row]))
         graph.constant("candidate_answer", answer.astype(np.min_scalar_type(int(answer.max()))))
         # Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs. A
-        # search may read LONGEST_LIST entries from the start of the last list.
-        candidate = np.append(candidate, np.zeros(LONGEST_LIST, np.int64))
+        # search may read MAX_LIST_LENGTH entries from the start of the last list.
+        candidate = np.append(candidate, np.zeros(MAX_LIST_LENGTH, np.int64))
         high = candidate >> 16
         graph.constant("candidates_low", (candidate & 0xFFFF).astype(np.uint16))
         graph.constant("candidates_high", high.astype(np.min_scalar_type(int(high.max()))))
@@ -230,7 +230,7 @@ class _Lookup:
         # Small tables over all values below 2 codes: from codes on a value is open, and its code counts from there.
         code = np.arange(2 * codes) % codes
         code_answer = np.where(code > near_codes, code - near_codes, code)
-        distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
+        distance = np.where(code == TOO_FAR_CODE, BEYOND_REACH, np.where(code > near_codes, NEAR_SURFACE, ON_SURFACE))
         answer = graph.at(graph.constant("value_answer", code_answer.astype(np.int32)), value)
         instance = graph.constant("value_instance", (code_answer - CODE_OFFSET).astype(np.int32))
         graph("Less", value, np.int32(codes), name="certain")

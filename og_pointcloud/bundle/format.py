@@ -33,19 +33,19 @@ from og_pointcloud.scene import Camera
 FORMAT = "ogpc"
 SCHEMA_VERSION = 2
 """Raised when older files can no longer be asked. In version 2 the graph itself settles points at borders."""
-ON_SURFACE, NEAR, BEYOND = 0, 1, 2
+ON_SURFACE, NEAR_SURFACE, BEYOND_REACH = 0, 1, 2
 """How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
 
 MAX_MEMBERS = 256
 MAX_MANIFEST_BYTES, MAX_NAMES_BYTES = 1 << 21, 1 << 23
 """Small, as parsed JSON takes up to twenty times its bytes in memory."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
-INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
+INTEGER_DTYPES, FLOAT_DTYPES = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
 REBUILD = "copy the file again, or make it again (og-pointcloud fit)"
 BANK = "bank/vectors.npy"
 INSTANCE_MEMBERS = {"part_of": "whole"}
 """Columns of the instance table whose member has another name, as it was in the first files of schema 2."""
-LATER_COLUMNS = ("reliability",)
+OPTIONAL_COLUMNS = ("reliability",)
 """Columns of the instance table that the first files of schema 2 lack."""
 RGB, CERTAINTY, CAMERAS = "arrays/rgb.npy", "arrays/certainty.npy", "arrays/cameras.npy"
 CARRIED_ENCODER = "text_encoder/"

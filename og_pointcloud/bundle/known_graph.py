@@ -24,7 +24,7 @@ before, since schema version 2. A change of that graph adds its digest here, and
 MODEL_FIELDS, GRAPH_FIELDS = {1, 2, 7, 8}, {1, 2, 5, 10, 11, 12}
 """Fields of onnx.proto3 that our graphs have. ModelProto: ir_version, producer_name, graph, opset_import. GraphProto:
 node, name, initializer, doc_string, input, output."""
-COUNT = "(answer codes)"
+CODE_COUNT_INPUT = "(answer codes)"
 """Stands in the digest for the name of the constant that holds their number."""
 TABLES = frozenset({
     "axis_places", "block_shifts", "brick_values", "candidate_answer", "candidate_x", "candidate_y", "candidate_z",
@@ -70,14 +70,19 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     nodes = [_Node(value) for number, value in graph if number == 1]
     # The first Concat makes the shape (answer codes, texts) of the table of scores.
     counting = next((node for node in nodes if node.operator == "Concat" and node.inputs), None)
-    # Two constants of one name, or one called COUNT, could stand in for one another in the digest.
-    if len(constants) != len(named) or COUNT in constants or counting is None or counting.inputs[0] not in constants:
+    # Two constants of one name, or one called CODE_COUNT_INPUT, could stand in for one another in the digest.
+    if (
+        len(constants) != len(named)
+        or CODE_COUNT_INPUT in constants
+        or counting is None
+        or counting.inputs[0] not in constants
+    ):
         raise ValueError("it does not count as graphs of ours do")
     # What the digest is of: versions, tables by kind, inputs and outputs by name, and every node in order.
     lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]
     lines += sorted(f"{name} {_kind(constant)}" for name, constant in constants.items() if name in TABLES)
     lines += [f"{number} {text_of(value, 1)!r}" for number, value in graph if number in (11, 12)]
-    codes, counting.inputs[0] = constants[counting.inputs[0]], COUNT
+    codes, counting.inputs[0] = constants[counting.inputs[0]], CODE_COUNT_INPUT
     lines += [node.line(constants) for node in nodes]
     return blake2b("\n".join(lines).encode(), digest_size=16).hexdigest(), constants, codes
 

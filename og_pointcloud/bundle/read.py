@@ -168,7 +168,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     xyz = _array(members, "arrays/xyz.npy", ("<f4",), (points, 3))
     if not np.isfinite(xyz).all():
         raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
-    ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGERS, (points,)).astype(np.int32)
+    ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGER_DTYPES, (points,)).astype(np.int32)
     ids.flags.writeable = False  # as all other arrays of a file are
     rgb = _array(members, ogpc.RGB, ("|u1",), (points, 3)) if ogpc.RGB in members else None
     certainty = _array(members, ogpc.CERTAINTY, ("|u1",), (points,)) if ogpc.CERTAINTY in members else None
@@ -201,7 +201,7 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
     columns: dict[str, NDArray[Any]] = {}
     for field in fields(InstanceTable):
         member = f"arrays/instances/{ogpc.INSTANCE_MEMBERS.get(field.name, field.name)}.npy"
-        if field.name == "descriptors" or (field.name in ogpc.LATER_COLUMNS and member not in members):
+        if field.name == "descriptors" or (field.name in ogpc.OPTIONAL_COLUMNS and member not in members):
             continue
         dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
         length = len(descriptors) if field.name == "descriptor_instance" else count
@@ -255,7 +255,7 @@ def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabula
         check_names(names)
     except OgPointcloudError as error:
         raise _Refused(f"vocabulary/names.json: {error}") from None
-    vectors = _array(members, "vocabulary/vectors.npy", ogpc.FLOATS, (words, None))
+    vectors = _array(members, "vocabulary/vectors.npy", ogpc.FLOAT_DTYPES, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
 
 

@@ -18,7 +18,7 @@ from og_pointcloud.show.live import CHANGES
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import choose_viewpoint
 
-STATES = tuple(CHANGES)[:4]
+CHANGE_LABELS = tuple(CHANGES)[:4]
 """Labels of the page: gone, new, and from where to where things moved; what has none of them is as it was, or was not
 seen again."""
 
@@ -61,13 +61,13 @@ def write_changes_page(
     scene = LabelledScene.from_cloud(both)
     # The page shows changes as if they were labels; what is as it was has none.
     labels = np.append(change, [-1, -1])[both.instance_ids].astype(np.int32)  # states -2 and -1 index the last two
-    labels[labels >= len(STATES)] = -1
+    labels[labels >= len(CHANGE_LABELS)] = -1
     reasons = np.where(labels < 0, Reason.NONE_FITS, Reason.LABELLED).astype(np.int8)
     result = Segmentation(
-        scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, STATES, scene.path
+        scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, CHANGE_LABELS, scene.path
     )
     view = choose_viewpoint(scene.xyz, labels >= 0, up)
-    colors = tuple(CHANGES[name] for name in STATES)
+    colors = tuple(CHANGES[name] for name in CHANGE_LABELS)
     look = Look(
         f"What changed: {changes}", boxes=True, cut=0.2, colors=colors, unlabelled="as it was, or not seen again"
     )

@@ -12,13 +12,13 @@ from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Camera, Points
 
-SCALE, OPACITY = 0.7, 0.95
+SPLAT_SCALE_SPACINGS, SPLAT_OPACITY = 0.7, 0.95
 """Standard deviation, in point spacings, and opacity of a plain point's splat: surfaces look closed."""
 
 
 def as_splats(points: Points, spacing: float) -> Points:
     """The points as round splats. spacing: typical distance between neighboring points."""
-    splats = isotropic(points, np.full(len(points), spacing, np.float32), SCALE, OPACITY)
+    splats = isotropic(points, np.full(len(points), spacing, np.float32), SPLAT_SCALE_SPACINGS, SPLAT_OPACITY)
     return replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
 
 

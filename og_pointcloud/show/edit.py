@@ -48,9 +48,9 @@ What: TypeAlias = "str | SupportsIndex | Iterable[SupportsIndex] | Pick | Match 
 
 Rows = NDArray[np.void]
 
-SAME_PLACE = 1e-3
+SAME_POINT_SPACINGS = 1e-3
 """Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
-RIGID = 1e-4
+ROTATION_TOLERANCE = 1e-4
 """How far a pose may be off a rotation times one scale, in any entry of R R' - 1."""
 
 
@@ -231,7 +231,7 @@ def _is_same(one: LabelledScene, other: LabelledScene) -> bool:
 
 def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None) -> tuple[IntArray, tuple[str, ...]]:
     """Instance id of each point of the cloud: the scene's own where it is the same cloud, else the nearest point's."""
-    if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_PLACE * scene.cloud.spacing).all():
+    if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_POINT_SPACINGS * scene.cloud.spacing).all():
         return scene.instance_ids, ()
     ids = scene.instances_at(xyz)
     far = int((ids == TOO_FAR).sum())
@@ -304,7 +304,7 @@ def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = np.cbrt(determinant)  # det(s R) = s^3
     rotation = matrix[:3, :3] / (scale if scale > 0 else 1)
-    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
+    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise SceneError(
             f"pose has a determinant of {determinant:.4g} and shears or mirrors; expected a rotation times one "
             "positive scale: Gaussians cannot follow any other"

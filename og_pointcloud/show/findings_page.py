@@ -20,16 +20,16 @@ from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.show.viewpoint import Viewpoint
 
 SIDE_PX = 200
-AROUND = 0.35
+MARGIN_SHARE = 0.35
 """How much of a thing's largest length is shown around it."""
-MOST_POINTS = 60_000
+MAX_POINTS = 60_000
 """Points that a picture is drawn from."""
-EYE, UP = np.array([1.0, -1.4, 1.1]), np.array([0.0, 0.0, 1.0])
+EYE_DIRECTION, UP_DIRECTION = np.array([1.0, -1.4, 1.1]), np.array([0.0, 0.0, 1.0])
 """Where the eye is, as seen from the thing; z is up, as `og-pointcloud view` has it unless told."""
-FAR = 20.0
+EYE_DISTANCE_WIDTHS = 20.0
 """How far away it is, in widths of the picture: hardly any perspective."""
-PAPER = 250
-FADED = 0.6
+BACKGROUND_GRAY = 250
+FADE_SHARE = 0.6
 """How far what is around a thing fades into the paper."""
 HIGHLIGHT = (214, 90, 40)
 """Color of things in clouds without colors."""
@@ -79,23 +79,27 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
 def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
     """A square PNG of an instance and what is around it, seen from far above and aside."""
     half = np.array(finding.size) / 2
-    reach = half + AROUND * max(2 * half.max(), 8 * cloud.spacing)
+    reach = half + MARGIN_SHARE * max(2 * half.max(), 8 * cloud.spacing)
     # The thing's middle is the picture's origin.
     local = cloud.xyz - (np.array(finding.center) - cloud.origin).astype(np.float32)
     near = np.flatnonzero((np.abs(local) <= reach).all(axis=1))
-    near = near[:: 1 + len(near) // MOST_POINTS]
+    near = near[:: 1 + len(near) // MAX_POINTS]
     is_it = cloud.instance_ids[near] == finding.instance
     if cloud.rgb is None:
         colors = np.where(is_it[:, None], HIGHLIGHT, 150).astype(float)
     else:
         colors = cloud.rgb[near].astype(float)
-    colors[~is_it] += FADED * (PAPER - colors[~is_it])
+    colors[~is_it] += FADE_SHARE * (BACKGROUND_GRAY - colors[~is_it])
     shown = replace(
         cloud, xyz=local[near], origin=np.zeros(3), instance_ids=cloud.instance_ids[near], rgb=None, certainty=None
     )
-    eye = FAR * 2 * np.linalg.norm(reach) * EYE / np.linalg.norm(EYE)
-    front = front_points(shown, Viewpoint(eye, np.zeros(3), UP).camera(SIDE_PX, SIDE_PX, FAR * SIDE_PX))
-    return png_bytes(np.append(colors, [[PAPER] * 3], axis=0).astype(np.uint8)[front])  # -1, no point, is the last
+    eye = EYE_DISTANCE_WIDTHS * 2 * np.linalg.norm(reach) * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
+    front = front_points(
+        shown, Viewpoint(eye, np.zeros(3), UP_DIRECTION).camera(SIDE_PX, SIDE_PX, EYE_DISTANCE_WIDTHS * SIDE_PX)
+    )
+    return png_bytes(
+        np.append(colors, [[BACKGROUND_GRAY] * 3], axis=0).astype(np.uint8)[front]
+    )  # -1, no point, is the last
 
 
 def png_bytes(image: NDArray[np.uint8]) -> bytes:

@@ -22,21 +22,21 @@ from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, 
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
 from og_pointcloud.show.viewpoint import Viewpoint
-from og_pointcloud.text.words import LONGEST_WORD, Labels, TextFeatures
+from og_pointcloud.text.words import MAX_WORD_CHARACTERS, Labels, TextFeatures
 
-MODES = ("labels", "instances", "certainty", "changes", "photo")
+COLOR_MODES = ("labels", "instances", "certainty", "changes", "photo")
 CHANGES = {
     "gone": (200, 30, 60), "new": (24, 150, 70), "moved from here": (244, 178, 60), "moved to here": (226, 88, 34),
     "not seen at the last visit": (86, 110, 190), "as it was": NO_LABEL,
 }  # fmt: skip
 """What became of an instance between two visits, and its color. A map of several has no points of what left."""
-WORDS = 6
+MAX_WORDS_SHOWN = 6
 """Words that are shown of an instance."""
-MATCHES = 12
+MAX_MATCHES_SHOWN = 12
 """Instances that are listed for a word."""
-HINTED = 8
+MAX_HINT_WORDS = 8
 """Stored words that are named as examples."""
-DARKEST, LIGHTEST = 0.55, 1.10
+MIN_SHADE, MAX_SHADE = 0.55, 1.10
 """Factors of a label's color where the point's own is black and where it is white: shapes and shadows stay visible."""
 FADED = (0.72, 237)
 """What is not lit becomes its own grey, mixed with this share of this light grey."""
@@ -92,7 +92,7 @@ class LiveScene:
             "certainty": scene.certainty is not None,
             "photo": self.rgb is not None,
         }
-        self.modes = tuple(mode for mode in MODES if has.get(mode, True))
+        self.modes = tuple(mode for mode in COLOR_MODES if has.get(mode, True))
         self.mode = self.modes[0] if changes is None else "changes"
         self.lit: set[int] | None = None
         """Ids of the instances that stand out, None where all do."""
@@ -117,7 +117,7 @@ class LiveScene:
     @cached_property
     def instances(self) -> Instances:
         """The instances as a table, each with its best words."""
-        return instance_table(self.scene, text_features=self._text_features, words=WORDS)
+        return instance_table(self.scene, text_features=self._text_features, words=MAX_WORDS_SHOWN)
 
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
         """(name, RGB, points), the most frequent first and what has no label last; colors are gray where the mode does
@@ -173,7 +173,7 @@ class LiveScene:
     @cached_property
     def _shade(self) -> NDArray[np.float32]:
         light = (self._photo / 255) @ LUMINANCE
-        return (DARKEST + (LIGHTEST - DARKEST) * light).astype(np.float32)[:, None]
+        return (MIN_SHADE + (MAX_SHADE - MIN_SHADE) * light).astype(np.float32)[:, None]
 
     # What is answered -----------------------------------------------------------------------------------------------
 
@@ -182,18 +182,18 @@ class LiveScene:
         word, self.lit = text.strip(), None
         if not word:
             own = self.scene.vocabulary.names if self.scene.vocabulary else ()
-            examples = ", ".join([*own[:HINTED], "..."] if len(own) > HINTED else own)
+            examples = ", ".join([*own[:MAX_HINT_WORDS], "..."] if len(own) > MAX_HINT_WORDS else own)
             stored = [f"stored words: {examples}"] if own else []
             return Answer("", (*stored, "click a thing to learn what it is"))
         try:
             selection = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
-            return Answer(f"“{printable(word, LONGEST_WORD)}”", (str(error),))
+            return Answer(f"“{printable(word, MAX_WORD_CHARACTERS)}”", (str(error),))
         # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
         self.lit = set(selection.instances)
         of = counted(len(selection), "instance")
         fits = f"fits {len(self.lit)} of {of}" if self.lit else "fits no instance; closest:"
-        shown = selection[: min(max(len(self.lit), 5), MATCHES)]
+        shown = selection[: min(max(len(self.lit), 5), MAX_MATCHES_SHOWN)]
         bars = tuple((self._beside(match), match.score) for match in shown)
         return Answer(word, (fits,), bars, meaning(selection.calibrated))
 

@@ -23,15 +23,15 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
-from og_pointcloud.show.live import WORDS, meaning
+from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
 
 TEMPLATE = Path(__file__).with_name("page.html")
-MOST_POINTS = 2_000_000
+MAX_POINTS = 2_000_000
 """Points that a page holds; of larger clouds an even choice, about 16 MB."""
-MOST_SCORES = 4_000_000
+MAX_SCORES = 4_000_000
 """Scores of words on instances that a page holds; beyond, it has no words to search for."""
-LEVELS = 65535
+QUANTIZATION_STEPS = 65535
 """Steps of 16-bit coordinates and scores: a place is off by at most half a step, 1/131,000 of the cloud's extent."""
 
 
@@ -67,7 +67,7 @@ def write_page(
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:
         raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected points to show")
-    shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MOST_POINTS)).astype(np.int64)]
+    shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MAX_POINTS)).astype(np.int64)]
     left_out = [f"{len(result) - len(shown):,} of {len(result):,} points"] if len(shown) < len(result) else []
     words, word_data = _words(scene)
     if not words and scene.vocabulary and scene.vocabulary.names:
@@ -92,7 +92,7 @@ def write_page(
         "reasons": [str(Reason.TOO_FAR), str(Reason.UNOBSERVED), str(Reason.IN_NO_MASK)],  # of ids -3, -2, -1
         "instances": _instances(scene, result, view.up, middle, word_data.pop("choice")),
         "points": len(shown), "has_rgb": rgb is not None,
-        "place": _packed(_levels(xyz, low, high)), "instance": _packed(result.instances[shown].astype("<i4")),
+        "place": _packed(_quantized(xyz, low, high)), "instance": _packed(result.instances[shown].astype("<i4")),
         "rgb": _packed(np.full((len(shown), 3), 200, np.uint8) if rgb is None else np.asarray(rgb, np.uint8)[shown]),
         "words": words, **word_data,
     }  # fmt: skip
@@ -107,12 +107,12 @@ def _words(scene: LabelledScene) -> tuple[list[str], dict[str, Any]]:
     """The scene's own words; their score on each instance, and which of them, if any, an instance is."""
     own, count = scene.vocabulary, len(scene.instances)
     nothing = {"choice": np.full(count, -1), "word_scores": "", "lowest": 0.0, "highest": 1.0}
-    if own is None or not own.names or count * len(own.names) > MOST_SCORES:
+    if own is None or not own.names or count * len(own.names) > MAX_SCORES:
         return [], nothing
     choice = scene.chooser.choose(own.vectors)
     scores = np.where(np.isfinite(choice.scores), choice.scores, 0).astype(np.float64)
     low, high = float(scores.min(initial=0)), float(scores.max(initial=1))
-    packed = _packed(_levels(scores, np.float64(low), np.float64(high)))
+    packed = _packed(_quantized(scores, np.float64(low), np.float64(high)))
     return list(own.names), {"choice": choice.labels, "word_scores": packed, "lowest": low, "highest": high}
 
 
@@ -127,7 +127,7 @@ def _instances(
     present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
     shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []
-    for row in with_boxes(instance_table(scene, up=up, words=WORDS)):
+    for row in with_boxes(instance_table(scene, up=up, words=MAX_WORDS_SHOWN)):
         label, points = shown.get(row.id, (-1, 0))
         record: dict[str, Any] = {
             "id": row.id, "label": label, "points": points, "views": row.views, "words": row.words,
@@ -142,8 +142,8 @@ def _instances(
     return rows
 
 
-def _levels(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
-    return np.rint((values - low) / np.where(high > low, high - low, 1) * LEVELS).astype("<u2")
+def _quantized(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
+    return np.rint((values - low) / np.where(high > low, high - low, 1) * QUANTIZATION_STEPS).astype("<u2")
 
 
 def _packed(array: NDArray[Any]) -> str:

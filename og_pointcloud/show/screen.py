@@ -25,23 +25,23 @@ from og_pointcloud.formats.poses import rigid
 from og_pointcloud.scene import Camera
 from og_pointcloud.show.live import LiveScene
 
-POINT_SIZE = 0.95
+POINT_RADIUS_SPACINGS = 0.95
 """Radius of a point in spacings: large enough that surfaces look closed."""
-SLOW_S = 0.15
+SLOW_BROWSER_S = 0.15
 """A browser is slow where points add more to the seconds of a picture that it is asked for, two frames each."""
-PROBES, PROBE_PX, PROBE_S = 3, (48, 64), 20.0
+PROBE_COUNT, PROBE_PX, PROBE_S = 3, (48, 64), 20.0
 """Pictures that are asked for, of which the quickest counts; their height and width; and how long each is waited for:
 a page that nobody sees draws none."""
-TURNING_POINTS = 30_000
+TURNING_VIEW_POINTS = 30_000
 """Points, about, of a picture while the view turns."""
-REST_S = 0.25
+REST_DELAY_S = 0.25
 """Seconds without a turn until all points are drawn."""
-BEHIND_S = 1.0
+BACKGROUND_DELAY_S = 1.0
 """Seconds without other colors until the canvas itself gets them: that keeps a slow browser busy for half of one."""
-QUALITY = 92
+JPEG_QUALITY = 92
 """Of pictures as JPEG."""
-PAPER = np.full((1, 3), 255, np.uint8)
-OVER = (
+BACKGROUND_RGB = np.full((1, 3), 255, np.uint8)
+OVERLAY_HTML = (
     "<style>div:has(> canvas[data-engine])::after{{content:'';position:absolute;inset:0;pointer-events:none;"
     "background:url(data:image/jpeg;base64,{}) 0 0/100% 100%}}</style>"
 )
@@ -62,7 +62,7 @@ class _Shown:
         """That points are drawn by."""
         return self.live.scene.cloud.spacing * self.size
 
-    def every(self, step: int) -> DrawnPoints:
+    def subsampled(self, step: int) -> DrawnPoints:
         """One point in so many, and as much larger."""
         spacing = self.spacing * step**0.5
         return DrawnPoints(self.xyz[::step], np.zeros(3), spacing, self.live.scene.cloud.reach)
@@ -77,10 +77,10 @@ class Screen:
         self._timing = threading.Lock()  # two timings at once would hold each other up
         self._shown: _Shown | None = None
         self._node: Any = None
-        self._colors = PAPER
+        self._colors = BACKGROUND_RGB
         self._front: NDArray[np.int64] | None = None
-        self._behind = threading.Timer(BEHIND_S, lambda: None)
-        self._over = client.gui.add_html("")
+        self._background_timer = threading.Timer(BACKGROUND_DELAY_S, lambda: None)
+        self._overlay = client.gui.add_html("")
         self.sends_pictures, self._open, self._turned = False, True, threading.Event()
         client.camera.on_update(lambda _: self._turned.set())
         threading.Thread(target=self._follow, daemon=True).start()
@@ -91,8 +91,8 @@ class Screen:
             xyz = (live.xyz - middle).astype(np.float32)  # browsers draw in float32
             self._shown = _Shown(live, xyz, size)
             self.sends_pictures, self._front, self._colors = False, None, live.colors()
-            self._over.content = ""
-            self._behind.cancel()
+            self._overlay.content = ""
+            self._background_timer.cancel()
             self._client.scene.set_background_image(None)
             self._node = _add_points(self._client.scene, self._shown, self._colors)
             timing = threading.Thread(target=self._time, args=[self._node], daemon=True)
@@ -103,7 +103,7 @@ class Screen:
         with self._lock:
             self._colors = colors
             if self.sends_pictures:
-                self._send(BEHIND_S)
+                self._send(BACKGROUND_DELAY_S)
             elif hasattr(self._node, "colors"):
                 self._node.colors = colors
             elif self._node.visible:
@@ -116,7 +116,7 @@ class Screen:
                 return
             self._shown = replace(self._shown, size=size)
             if hasattr(self._node, "point_size"):
-                self._node.point_size = POINT_SIZE * self._shown.spacing
+                self._node.point_size = POINT_RADIUS_SPACINGS * self._shown.spacing
         self._turned.set()
 
     def picture(self) -> NDArray[np.uint8]:
@@ -138,12 +138,12 @@ class Screen:
         with self._timing:
             try:
                 by_points = self._probe(node)
-                if by_points > SLOW_S:  # by the points, not by the way there and back
+                if by_points > SLOW_BROWSER_S:  # by the points, not by the way there and back
                     self._switch(node, points=False)
                     by_points -= self._probe(node)
             except (RuntimeError, TimeoutError):  # it left, or nobody looks at it
                 by_points = 0.0
-            self._switch(node, points=by_points <= SLOW_S, pictures=by_points > SLOW_S)
+            self._switch(node, points=by_points <= SLOW_BROWSER_S, pictures=by_points > SLOW_BROWSER_S)
 
     def _switch(self, node: Any, *, points: bool, pictures: bool = False) -> None:
         """Show points, pictures or neither, unless others are on show by now, of the same scene perhaps, or nobody is
@@ -165,7 +165,7 @@ class Screen:
         """Seconds until a small picture is here; 0 once the browser has left, or other points are on show, which are
         timed by themselves."""
         seconds = []
-        for _ in range(PROBES):
+        for _ in range(PROBE_COUNT):
             if not self._open or self._node is not node:
                 return 0.0
             start = time.monotonic()
@@ -180,9 +180,9 @@ class Screen:
             shown = self._shown
             if not self.sends_pictures or shown is None:
                 continue
-            step = 1 + len(shown.xyz) // TURNING_POINTS
+            step = 1 + len(shown.xyz) // TURNING_VIEW_POINTS
             self._draw(shown, step)
-            if step > 1 and not self._turned.wait(REST_S):
+            if step > 1 and not self._turned.wait(REST_DELAY_S):
                 self._draw(shown, 1)
 
     def _draw(self, shown: _Shown, step: int) -> None:
@@ -190,7 +190,7 @@ class Screen:
         camera = self._camera()
         if camera is None:
             return
-        front = front_points(shown.every(step), camera)
+        front = front_points(shown.subsampled(step), camera)
         front[front >= 0] *= step
         with self._lock:
             if self.sends_pictures and shown is self._shown:
@@ -212,24 +212,24 @@ class Screen:
         """The picture of the view in today's colors. wait_s: until the canvas draws it too."""
         if self._front is not None and self._open:
             picture = self._colored(self._front)
-            file = imageio.v3.imwrite("<bytes>", picture, extension=".jpg", quality=QUALITY)
-            self._over.content = OVER.format(base64.b64encode(file).decode())
+            file = imageio.v3.imwrite("<bytes>", picture, extension=".jpg", quality=JPEG_QUALITY)
+            self._overlay.content = OVERLAY_HTML.format(base64.b64encode(file).decode())
             self._client.flush()
-            self._behind.cancel()
-            self._behind = threading.Timer(wait_s, self._put_behind)
-            self._behind.daemon = True
-            self._behind.start()
+            self._background_timer.cancel()
+            self._background_timer = threading.Timer(wait_s, self._draw_background)
+            self._background_timer.daemon = True
+            self._background_timer.start()
 
-    def _put_behind(self) -> None:
+    def _draw_background(self) -> None:
         """Have the canvas draw the picture, as it is by now, unless points are on show: timers may fire late."""
         with self._lock:
             if self.sends_pictures and self._open and self._front is not None:
-                self._client.scene.set_background_image(self._colored(self._front), "jpeg", jpeg_quality=QUALITY)
+                self._client.scene.set_background_image(self._colored(self._front), "jpeg", jpeg_quality=JPEG_QUALITY)
                 self._client.flush()
 
     def _colored(self, front: NDArray[np.int64]) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: the points that the pixels show, in today's colors."""
-        palette = np.concatenate([self._colors, PAPER])
+        palette = np.concatenate([self._colors, BACKGROUND_RGB])
         return palette.take(front, axis=0, mode="wrap")  # NO_POINT, -1, reads the paper
 
 
@@ -238,7 +238,7 @@ def _add_points(scene: viser.SceneApi, shown: _Shown, colors: NDArray[np.uint8])
     splats = shown.live.shown
     if splats is None or splats.scale is None or splats.rotation is None or splats.opacity is None:
         return scene.add_point_cloud(
-            "/scene", shown.xyz, colors, point_size=POINT_SIZE * shown.spacing, point_shape="circle",
+            "/scene", shown.xyz, colors, point_size=POINT_RADIUS_SPACINGS * shown.spacing, point_shape="circle",
             precision="float32", point_shading="flat",
         )  # fmt: skip
     # Covariance R S S R' of each splat, S its standard deviations along its axes (3DGS).

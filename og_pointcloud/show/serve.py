@@ -24,12 +24,12 @@ from og_pointcloud.show.live import Answer, LiveScene
 from og_pointcloud.show.screen import Screen
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
-LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
+LOOPBACK, PORT, PORT_COUNT = "127.0.0.1", 8080, 1 << 16
 HEIGHT_PX = 640
 """Height of the page in a notebook."""
-LISTED = 300
+MAX_INSTANCES_LISTED = 300
 """Instances in the list, the largest ones."""
-EVERYTHING = "all"
+ALL_INSTANCES = "all"
 TITLE = "og_pointcloud"
 ROW = '<div style="display:flex;gap:8px;align-items:center;padding:1px 0">{}</div>'
 SWATCH = '<i style="flex:none;width:12px;height:12px;border-radius:50%;background:rgb{}"></i>'
@@ -72,8 +72,10 @@ def _check_address(host: str, port: int) -> None:
     except OSError as error:
         cure = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them"
         raise OgPointcloudError(f"nothing can listen at '{host}' ({error}); {cure}") from None
-    if not 0 <= port < PORTS:
-        raise OgPointcloudError(f"the port is {port}; expected a number from 0, for any that is free, to {PORTS - 1}")
+    if not 0 <= port < PORT_COUNT:
+        raise OgPointcloudError(
+            f"the port is {port}; expected a number from 0, for any that is free, to {PORT_COUNT - 1}"
+        )
 
 
 def show(scene: Any, labels: Any = None, *, text_features: Any = None) -> LivePage:
@@ -98,8 +100,8 @@ class LivePage:
         self._screens: dict[int, Screen] = {}
         self._add_controls()
         self._show_scene()
-        self._server.on_client_connect(self._came)
-        self._server.on_client_disconnect(self._left)
+        self._server.on_client_connect(self._client_connected)
+        self._server.on_client_disconnect(self._client_left)
 
     @property
     def url(self) -> str:
@@ -145,7 +147,7 @@ class LivePage:
         self._answer = gui.add_html("")
         self._mode = gui.add_dropdown("colors", self._live.modes)
         self._mode.on_update(self._guarded(self._change_mode))
-        self._list: Any = gui.add_dropdown("instance", (EVERYTHING,))
+        self._list: Any = gui.add_dropdown("instance", (ALL_INSTANCES,))
         self._list.on_update(self._guarded(self._chosen))
         self._size = gui.add_slider("point size", 0.3, 4.0, 0.05, 1.0)
         self._size.on_update(self._guarded(self._resize))
@@ -169,23 +171,23 @@ class LivePage:
             self._ask()
 
     def _ask(self) -> None:
-        self._tell(self._live.ask(self._word.value))
-        self._list.value = EVERYTHING
+        self._show_answer(self._live.ask(self._word.value))
+        self._list.value = ALL_INSTANCES
 
     def _chosen(self) -> None:
         row = self._list.value
         if row not in self._list.options:
             return  # of a scene that another browser has just changed
         self._word.value = ""
-        self._tell(self._live.ask("") if row == EVERYTHING else self._live.choose(int(row.split(" ")[0])))
+        self._show_answer(self._live.ask("") if row == ALL_INSTANCES else self._live.choose(int(row.split(" ")[0])))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         camera = event.client.camera
         focal_px = camera.image_height / 2 / np.tan(camera.fov / 2)
         with self._lock:
             eye = np.array(event.ray_origin) + self._middle
-            self._tell(self._live.click(eye, np.array(event.ray_direction), focal_px))
-            self._word.value, self._list.value = "", EVERYTHING
+            self._show_answer(self._live.click(eye, np.array(event.ray_direction), focal_px))
+            self._word.value, self._list.value = "", ALL_INSTANCES
 
     def _change_mode(self) -> None:
         self._live.mode = self._mode.value
@@ -225,20 +227,20 @@ class LivePage:
         for screen in self._screens.values():
             screen.show(live, self._middle, self._size.value)
         self._mode.options, self._mode.value = live.modes, live.mode
-        rows = [row for row in live.instances.largest(LISTED) if row.points]
-        self._list.options = (EVERYTHING, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
-        self._word.value, self._list.value = "", EVERYTHING
+        rows = [row for row in live.instances.largest(MAX_INSTANCES_LISTED) if row.points]
+        self._list.options = (ALL_INSTANCES, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
+        self._word.value, self._list.value = "", ALL_INSTANCES
         self._legend.content = legend_html(live)
-        self._tell(live.ask(""))
+        self._show_answer(live.ask(""))
 
-    def _came(self, client: viser.ClientHandle) -> None:
+    def _client_connected(self, client: viser.ClientHandle) -> None:
         with self._lock:
             if client.client_id not in self._server.get_clients():
                 return  # it has left already, perhaps before this: both come from threads
             screen = self._screens[client.client_id] = Screen(client)
             screen.show(self._live, self._middle, self._size.value)
 
-    def _left(self, client: viser.ClientHandle) -> None:
+    def _client_left(self, client: viser.ClientHandle) -> None:
         with self._lock:
             if screen := self._screens.pop(client.client_id, None):
                 screen.close()
@@ -252,7 +254,7 @@ class LivePage:
         for screen in self._screens.values():
             screen.paint(colors)
 
-    def _tell(self, answer: Answer) -> None:
+    def _show_answer(self, answer: Answer) -> None:
         """Show an answer and its colors. Beside points it goes first, by itself: a browser shows that at once, and
         colors with the next frame that it draws. Beside pictures all goes together: another frame would hold them up.
         """

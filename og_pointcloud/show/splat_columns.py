@@ -29,7 +29,7 @@ NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 RGB = ("red", "green", "blue")
 COLORS = (*RGB, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
 """All names of color columns, which give way to RGB of type uchar."""
-DARK = 0.05
+MIN_MEAN_LUMINANCE = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new color at its full strength."""
 MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
@@ -69,7 +69,7 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
     if set(LOG_SCALE) <= set(columns):  # 3DGS stores logarithms of standard deviations
         _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
-        _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION)))
+        _set(columns, ROTATION, _rotated(quaternion_of(rotation), stack_columns(rows, ROTATION)))
     rest = _rest(rows)
     _set(columns, _rest_names(rows), rotated_harmonics(rest, rotation))
     too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
@@ -108,10 +108,10 @@ def _color_map(base: DoubleArray, color: DoubleArray) -> tuple[DoubleArray, Doub
     """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color; and (3,) what is added to them
     where they are too dark for it, so that their mean becomes that color."""
     mean = float((base @ LUMINANCE).mean())
-    return np.outer(color, LUMINANCE) / max(mean, DARK), color * max(0.0, 1 - mean / DARK)
+    return np.outer(color, LUMINANCE) / max(mean, MIN_MEAN_LUMINANCE), color * max(0.0, 1 - mean / MIN_MEAN_LUMINANCE)
 
 
-def _turned(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
+def _rotated(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
     """(n, 4) quaternions wxyz times a turn from the left (Hamilton); their lengths, which mean nothing, stay."""
     quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
     (a, b, c, d), (w, x, y, z) = turn, quaternions.T

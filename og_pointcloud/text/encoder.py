@@ -30,7 +30,7 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import MANIFEST, MODEL_NAME, EncoderFormat, home_folder, open_session
-from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
+from og_pointcloud.text.tokenizer import MAX_CHARACTERS, open_tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -49,9 +49,9 @@ DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
 """The encoder that comes with the library: it knows the demo's room and nothing else of the world."""
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
-MOST_TEMPLATES, LONGEST_TEMPLATE = 128, 400
+MAX_TEMPLATES, MAX_TEMPLATE_CHARACTERS = 128, 400
 """Templates an encoder may have, and characters of one. CLIP was published with 80 templates for ImageNet."""
-VECTORS_REMEMBERED = 1 << 14
+MAX_CACHED_VECTORS = 1 << 14
 ENCODER = EncoderFormat(
     "og-text-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export text", {TOKENIZER: 1 << 26, WORD_BANK: 1 << 26},
     optional=WORD_BANK,
@@ -88,13 +88,13 @@ class TextEncoder:
     def __call__(self, names: Sequence[str]) -> NDArray[np.float32]:
         """(len(names), D) float32, unit rows: of each name the mean over the manifest's templates."""
         # The ensemble of prompts of CLIP (Radford et al. 2021): unit vectors are averaged, their mean made unit again.
-        texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in self.templates]
+        texts = [template.replace("{}", name[:MAX_CHARACTERS]) for name in names for template in self.templates]
         vectors = self.encode(texts).reshape(len(names), len(self.templates), self.width).mean(axis=1)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(len(texts), D) float32, unit rows: the texts as they stand."""
-        remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}  # full: begun anew
+        remembered = self._remembered if len(self._remembered) < MAX_CACHED_VECTORS else {}  # full: begun anew
         missing = [text for text in dict.fromkeys(texts) if text not in remembered]
         for batch, tokens in self._batches(missing):
             vectors = ENCODER.vectors(self._session, tokens, (len(tokens), self.width), self.where)
@@ -195,10 +195,10 @@ def cache_folder() -> Path:
 def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
     """At least one text with ``{}`` in it, of bounded number and length, else OgPointcloudError."""
     templates = (templates,) if isinstance(templates, str) else tuple(templates)
-    if len(templates) > MOST_TEMPLATES or any(len(str(template)) > LONGEST_TEMPLATE for template in templates):
+    if len(templates) > MAX_TEMPLATES or any(len(str(template)) > MAX_TEMPLATE_CHARACTERS for template in templates):
         raise OgPointcloudError(
             f"{len(templates)} templates of up to {max(len(str(template)) for template in templates)} characters; "
-            f"expected at most {MOST_TEMPLATES} of {LONGEST_TEMPLATE}: each is encoded for every word"
+            f"expected at most {MAX_TEMPLATES} of {MAX_TEMPLATE_CHARACTERS}: each is encoded for every word"
         )
     wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
     if wrong or not templates:

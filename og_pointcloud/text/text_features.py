@@ -20,7 +20,7 @@ from og_pointcloud.formats.npy import read_npz
 
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_WORDS_BYTES = 1 << 24
-LONGEST_NAME = 1000
+MAX_NAME_CHARACTERS = 1000
 
 
 def read_text_features(path: StrPath) -> tuple[Vocabulary, str]:
@@ -63,9 +63,9 @@ def check_names(names: Sequence[str]) -> None:
     """OgPointcloudError for a name in a file that is longer than any word, or holds half a character."""
     for name in names:
         # Lone surrogates, halves of a character, cannot be written as UTF-8.
-        if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
+        if len(name) > MAX_NAME_CHARACTERS or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
-                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {MAX_NAME_CHARACTERS}"
             )
 
 

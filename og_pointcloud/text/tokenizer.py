@@ -31,22 +31,22 @@ CLIP_NORMALIZER = {
         {"type": "Lowercase"},
     ],
 }
-SIGN = "[!-/:-@\\[-`{-~ ]"
+PUNCTUATION = "[!-/:-@\\[-`{-~ ]"
 """One character of ASCII's punctuation, or a space."""
-LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:\+|\{{2,\}})?")
+LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{PUNCTUATION}|(?![\[\\\]]){PUNCTUATION})+\])(?:\+|\{{2,\}})?")
 """Regular expressions that no text makes slow: one character class, once or repeated."""
-MOST_CHARACTERS = 4096
+MAX_CHARACTERS = 4096
 """A longer text is cut here before anything else; contexts hold 77 tokens or fewer."""
-LONGEST_PIECE, MOST_ADDED = 256, 1 << 12
+MAX_PIECE_CHARACTERS, MAX_ADDED_PIECES = 256, 1 << 12
 """Characters of a piece, and pieces added to the vocabulary. Unigrams take time by the square of a piece's length."""
-MOST_GROWTH = 256
+MAX_GROWTH = 256
 """How many times longer a normalizer may make a text."""
 GROWTH = {
     "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Lowercase": 3, "Strip": 1, "StripAccents": 1, "Nmt": 1,
     "BertNormalizer": 4, "ByteLevel": 4, "Prepend": 2,
 }  # fmt: skip
 """How many times longer each step of a normalizer makes a text at worst, by Unicode's own tables."""
-PIECES_REMEMBERED = 1 << 14
+MAX_CACHED_PIECES = 1 << 14
 
 
 class Tokenizer(Protocol):
@@ -121,7 +121,7 @@ class ClipTokenizer:
         self._context_length = context_length
         self._start, self._end = _id(frame["cls"][1]), _id(frame["sep"][1])
         pairs = BytePairs(model["vocab"], model["merges"])
-        self._piece_ids = lru_cache(PIECES_REMEMBERED)(pairs)
+        self._piece_ids = lru_cache(MAX_CACHED_PIECES)(pairs)
         self.highest_id = max(*pairs.vocabulary.values(), self._start, self._end)
 
     def __call__(self, text: str) -> list[int]:
@@ -134,8 +134,8 @@ class ClipTokenizer:
 
 
 def _short(text: str) -> str:
-    """At most MOST_CHARACTERS, all of them characters."""
-    return text[:MOST_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    """At most MAX_CHARACTERS, all of them characters."""
+    return text[:MAX_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 def _cleaned(text: str) -> str:
@@ -158,7 +158,7 @@ def _words(text: str) -> Iterator[str]:
             position += 1
 
 
-@lru_cache(PIECES_REMEMBERED)
+@lru_cache(MAX_CACHED_PIECES)
 def _kind(character: str) -> str:
     """L letter, N number, S white space, O any other."""
     category = unicodedata.category(character)[0]
@@ -243,15 +243,15 @@ def _check_other(description: dict[str, Any]) -> None:
             raise ValueError(f"it looks for the pattern {pattern!r:.80}, which some texts may make slow")
 
     growth = _growth(description.get("normalizer") or {"type": "Strip"})
-    if growth > MOST_GROWTH:
-        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MOST_GROWTH}")
+    if growth > MAX_GROWTH:
+        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MAX_GROWTH}")
     vocabulary, added = model["vocab"], description.get("added_tokens") or []
     pieces = vocabulary if isinstance(vocabulary, dict) else (entry[0] for entry in vocabulary)
     longest = max((len(piece) for piece in (*pieces, *(token["content"] for token in added))), default=0)
-    if longest > LONGEST_PIECE or len(added) > MOST_ADDED:
+    if longest > MAX_PIECE_CHARACTERS or len(added) > MAX_ADDED_PIECES:
         raise ValueError(
-            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most {LONGEST_PIECE} and "
-            f"{MOST_ADDED}"
+            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most "
+            f"{MAX_PIECE_CHARACTERS} and {MAX_ADDED_PIECES}"
         )
 
 
@@ -267,7 +267,7 @@ def _growth(step: dict[str, Any]) -> float:
         table = base64.b64decode(step["precompiled_charsmap"] or "")
         trie = 4 + int.from_bytes(table[:4], "little")
         return max(map(len, table[trie:].split(b"\0")))
-    if kind not in GROWTH or len(step.get("prepend", "")) > LONGEST_PIECE:
+    if kind not in GROWTH or len(step.get("prepend", "")) > MAX_PIECE_CHARACTERS:
         raise ValueError(f"its normalizer is a {kind!r:.40}; expected {', '.join(GROWTH)}")
     return GROWTH[kind]
 

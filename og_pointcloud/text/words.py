@@ -18,9 +18,9 @@ from og_pointcloud.text.text_features import checked_vocabulary, read_text_featu
 
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
 TextFeatures: TypeAlias = "StrPath | tuple[Vocabulary, str] | None"
-LONGEST_WORD = 60
+MAX_WORD_CHARACTERS = 60
 """Characters of a word that is not known that are said again."""
-FEW_WORDS = 24
+MAX_LISTED_WORDS = 24
 """Known words that are all named where one is asked for that is not among them, nor like any."""
 
 
@@ -127,8 +127,8 @@ def _looked_up(
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
         hint = did_you_mean(missing[0], vectors, " If not")
-        first = printable(missing[0], LONGEST_WORD)
-        few = not hint and 0 < len(vectors) <= FEW_WORDS
+        first = printable(missing[0], MAX_WORD_CHARACTERS)
+        few = not hint and 0 < len(vectors) <= MAX_LISTED_WORDS
         known = f" ({printable(', '.join(sorted(vectors)), 300)})" if few else ""
         raise OgPointcloudError(
             f"'{first}' is not among the {len(vectors)} known words{known}{others}{hint}: {_ways(feature_space)}"
