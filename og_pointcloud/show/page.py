@@ -1,6 +1,6 @@
-"""A scene as one HTML page that needs nothing else: turn it, ask it by clicks and words, switch labels on and off.
+"""A scene as one self-contained HTML page: rotate it, query it by clicks and words, switch labels on and off.
 
-page.html is the page; what it shows is put into it as JSON, arrays as deflated base64. Needs numpy alone.
+page.html is the template; the data is inserted as JSON, arrays as deflated base64. Needs numpy alone.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from og_pointcloud.show.viewpoint import Viewpoint
 
 TEMPLATE = Path(__file__).with_name("page.html")
 MAX_POINTS = 2_000_000
-"""Points that a page holds; of larger clouds an even choice, about 16 MB."""
+"""Points of a page, about 16 MB; larger clouds are subsampled evenly."""
 MAX_SCORES = 4_000_000
-"""Scores of words on instances that a page holds; beyond, it has no words to search for."""
+"""Scores of words on instances that a page holds; with more, it has no word search."""
 QUANTIZATION_STEPS = 65535
-"""Steps of 16-bit coordinates and scores: a place is off by at most half a step, 1/131,000 of the cloud's extent."""
+"""Steps of 16-bit coordinates and scores: positions are off by at most half a step, 1/131,000 of the cloud's extent."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a page begins; a click changes all but the title.
+    """Initial state of a page; a click changes all but the title.
 
     mode: what colors show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
-    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number. unlabelled: what points without a
-    label are called.
+    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its index. unlabelled: name of points without a
+    label.
     """
 
     title: str
@@ -60,7 +60,7 @@ def write_page(
     look: Look,
     rgb: NDArray[np.uint8] | None = None,
 ) -> str:
-    """Write the page, whole or not at all; returns what it leaves out, in words, empty if nothing.
+    """Write the page atomically; returns what it leaves out, in words, empty if nothing.
 
     result: of ``scene``, at least one finite point. rgb: (N, 3) colors of its points.
     """
@@ -96,7 +96,7 @@ def write_page(
         "rgb": _packed(np.full((len(shown), 3), 200, np.uint8) if rgb is None else np.asarray(rgb, np.uint8)[shown]),
         "words": words, **word_data,
     }  # fmt: skip
-    # Names come from files: no text of theirs may end the element that holds it.
+    # Names come from files: none may close the HTML element that contains it.
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     page = TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text)
     write_file(path, page.encode(errors="backslashreplace"))
@@ -104,7 +104,7 @@ def write_page(
 
 
 def _words(scene: LabelledScene) -> tuple[list[str], dict[str, Any]]:
-    """The scene's own words; their score on each instance, and which of them, if any, an instance is."""
+    """The scene's own words; their scores on each instance, and the word chosen for each instance, if any."""
     own, count = scene.vocabulary, len(scene.instances)
     nothing = {"choice": np.full(count, -1), "word_scores": "", "lowest": 0.0, "highest": 1.0}
     if own is None or not own.names or count * len(own.names) > MAX_SCORES:
@@ -123,7 +123,7 @@ def _instances(
     middle: NDArray[np.float64],
     choice: NDArray[np.integer],
 ) -> list[dict[str, Any]]:
-    # All points of an instance have one label: that of its first one.
+    # All points of an instance have the same label: that of its first point.
     present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
     shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []
