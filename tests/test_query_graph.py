@@ -303,7 +303,7 @@ def test_distance_is_surface_near_or_beyond():
 
 def test_a_table_without_any_box_is_all_open(monkeypatch):
     cloud = CLOUDS["room"]
-    monkeypatch.setattr(lookup_grid, "BRICKS_PER_AXIS", 0)
+    monkeypatch.setattr(lookup_grid, "MAX_BRICKS_PER_AXIS", 0)
     assert not run(cloud, [[1e6, 0, 0]], texts(cloud))["certain"].any()
 
 

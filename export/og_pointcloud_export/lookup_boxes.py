@@ -1,16 +1,17 @@
-"""The kernel that builds the lookup grid: what is the nearest point's answer in each of a box's 4^3 children?
+"""The kernel that builds the lookup grid: finds the nearest point's answer in each of a box's 4^3 children.
 
-Every test is of a child, a cube, against points. Seen from its center, a point p is farther than a point q at all u of
-the cube if |u - p|^2 > |u - q|^2 everywhere. The difference is linear in u, so that its least value lies at a corner:
+Each test compares a child, a cube, with points in coordinates relative to its center. A point p is farther than a point
+q everywhere in the cube if |u - p|^2 > |u - q|^2 for all u in it. The difference is linear in u, so its minimum lies at
+a corner:
 
     |p|^2 - |q|^2 - 2 half |p - q|_1 > 0        (|.|_1: the sum of absolute coordinates)
 
-A point that loses to another in this way, or is out of reach of the cube, is nearest nowhere in it. If all points that
-are left have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
+A point that loses to another in this way, or is out of reach of the cube, is nearest nowhere in it. If all remaining
+points have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
 candidates among which a query in the child finds its nearest point; or the child is split into 4^3 children of its own.
 
-Cubes are inflated by ``rounding``, the most that float32 can move a query's cell, so that a query is always inside the
-child that it is looked up in.
+Cubes are inflated by ``rounding``, the most that float32 can move a query's cell, so that a query always lies inside
+the child in which it is looked up.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ import numpy as np
 from og_pointcloud.kernels import njit, prange
 
 EDGE = 4
-"""Children along the edge of a box that is split."""
+"""Children along the edge of a split box."""
 CHILDREN = EDGE**3
 MAX_SHARED_LIST_LENGTH = 8
-"""The graph compares so many candidates at once, so children share a list up to this length: it costs no time."""
+"""Children share lists up to this length; the graph always compares so many candidates, so sharing costs no time."""
 MAX_LIST_LENGTH = 64
-"""Most candidates of a child; one with more, as where points almost coincide, is left to the exact search."""
+"""Largest number of a child's candidates; with more, where points almost coincide, it is left to the exact search."""
 TOO_FAR_CODE = 0
 """Answer code of a query with no cloud point within reach."""
 NO_CHILD, SPLIT = -1, CHILDREN
-"""In place of a list's number: the child has none, as its answer is certain or left open; or it is split further."""
+"""In place of a list's index: the child has no list, as its answer is certain or left open; or it is split further."""
 MAX_COMPARED_CANDIDATES = 4 * MAX_LIST_LENGTH
-"""With more candidates than this, a child is split without comparing each with each."""
+"""With more candidates than this, a child is split without comparing all pairs."""
 
-# Helpers are called by kernels alone: without wrappers of their own they compile sooner.
+# Helpers are called only by kernels: without wrappers of their own they compile faster.
 _helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignore[reportCallIssue]
 
 # numba takes no dataclasses; these tuples are the records of this file:
