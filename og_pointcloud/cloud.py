@@ -1,4 +1,4 @@
-"""LabelledCloud: the contract between training, which makes one, and the runtime, which answers words from it."""
+"""LabelledCloud: the contract between training, which makes it, and the runtime, which labels points by it."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from og_pointcloud.scene import Camera, brief, require_finite, take_arrays
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
 UNOBSERVED = -2
-"""Instance id of a point that nothing is known about: no view saw it, nor does it lie on an observed surface."""
+"""Instance id of a point about which nothing is known: no view saw it, and it lies on no observed surface."""
 
 TOO_FAR = -3
-"""Instance answered for a query point with no cloud point within reach."""
+"""Instance id of a query point without a cloud point within reach."""
 UNKNOWN = -1
 """Label of a point that none of the names is known to fit."""
 UNKNOWN_SPACE = "unknown"
-"""Feature space of vectors whose encoder nobody named: they are compared by width alone."""
+"""Feature space of vectors of an unnamed encoder: only their width is checked."""
 NO_EVIDENCE = -2.0
 """Cosine of an instance without a descriptor: below every true one."""
-LENGTHS = (1e-30, 1e30)
-"""Shortest and longest spacing or reach of a scene: their squares and ratios are still finite in float64."""
-FARTHEST = 1e15
-"""Largest coordinate of a scene's origin, in its unit: beyond, float64 has no digits left for the points."""
+LENGTH_LIMITS = (1e-30, 1e30)
+"""Smallest and largest spacing or reach of a scene: their squares and ratios are still finite in float64."""
+MAX_ORIGIN = 1e15
+"""Largest coordinate of a scene's origin, in its unit: beyond it float64 has no digits left for the points."""
 MIN_BANK = 50
-"""Fewest words of a bank: of fewer the standard deviation is too uncertain to measure evidence in."""
+"""Smallest number of words in a bank: with fewer, the standard deviation is too uncertain as a unit of evidence."""
 
 
 @dataclass(frozen=True)
 class FeatureSpace:
-    """What makes vectors comparable: the encoder that they come from, and their width.
+    """What makes vectors comparable: their encoder and their width.
 
-    name: of the encoder, e.g. "openai/clip-vit-base-patch16"; UNKNOWN_SPACE where nobody named it, which fits any.
-    width: length of the vectors; 0 where there is none yet, which fits any.
+    name: of the encoder, e.g. "openai/clip-vit-base-patch16"; UNKNOWN_SPACE if it was not named, which fits any.
+    width: length of the vectors; 0 if there are none yet, which fits any.
     """
 
     name: str
@@ -51,7 +51,7 @@ class FeatureSpace:
 
     def accepts(self, other: FeatureSpace) -> bool:
         """Whether vectors of the other space can be compared with vectors of this one."""
-        # What is not known, a name or a width, speaks against nothing.
+        # An unknown name or width is compatible with any.
         same_encoder = self.name == other.name or UNKNOWN_SPACE in (self.name, other.name)
         return same_encoder and (self.width == other.width or 0 in (self.width, other.width))
 
@@ -66,18 +66,18 @@ class FeatureSpace:
 
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
-    """What is known of K instances; row k of each array is instance id k.
+    """What is known about K instances; row k of each array is instance id k.
 
-    descriptors: (R, D) float32, unit rows, grouped by instance: an instance has one or more, or none where no mask
-        gave it a feature (it then answers "unknown").
+    descriptors: (R, D) float32, unit rows, grouped by instance: an instance has one or more, or none if no mask gave it
+        a feature (it is then "unknown").
     descriptor_instance: (R,) int32, the instance of each descriptor, ascending.
     points: (K,) int32, points with this id. views, masks: (K,) int32, views that saw it and masks joined in it.
     agreement: (K,) float32 in [-1, 1], mean cosine of its masks' features with their descriptor.
     visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
     coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. part_of: (K,) int32, the
         instance that this one is a part of, -1 none; without cycles. Left empty, both become -1 throughout.
-    reliability: (K,) float32 in [0, 1], how far labels from half of the views give its points again, and its masks
-        name it (fitting/reliability.py); NaN where that is not known. Left empty, it is NaN throughout.
+    reliability: (K,) float32 in [0, 1], how well labels from half of the views reproduce its points, and its masks its
+        name (fitting/reliability.py); NaN if not known. Left empty, it is NaN throughout.
 
     >>> cloud.instances.points, cloud.instances.part_of  # of `LabelledCloud`'s example
     (array([2, 1], dtype=int32), array([-1, -1], dtype=int32))
@@ -102,7 +102,7 @@ class InstanceTable:
     def __post_init__(self) -> None:
         take_arrays(self, *(each.name for each in fields(self)))
         count = len(self.points)
-        # Frozen, so by object.__setattr__: what was left empty becomes "unknown" in every row.
+        # Frozen, so by object.__setattr__: a column left empty becomes "unknown" in every row.
         for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
             if len(getattr(self, name)) == 0:
                 object.__setattr__(self, name, np.full(count, unknown))
@@ -128,21 +128,21 @@ class InstanceTable:
 
     @property
     def overall_reliability(self) -> float | None:
-        """Mean reliability, by the fourth root of the instances' points: words count alike in a mIoU, but what few
-        points tell is uncertain. None where no instance's is known. It ranks fits nearly as mIoU does, which needs
-        truth; 1 is not to be expected."""
+        """Mean reliability, weighted by the fourth root of the instances' points: words count equally in a mIoU, but
+        the reliability of few points is uncertain. None if no instance's is known. It ranks fits almost as mIoU does,
+        which needs ground truth; 1 is not to be expected."""
         known = np.isfinite(self.reliability) & (self.points > 0)
         if not known.any():
             return None
         return float(np.average(self.reliability[known].astype(np.float64), weights=self.points[known] ** 0.25))
 
     def cosines(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(K, L) best cosine of each instance's descriptors with each of vectors (L, D); -2 where it has no descriptor.
+        """(K, L) best cosine of each instance's descriptors with each of vectors (L, D); -2 if it has no descriptor.
 
         In the vectors' precision, at least float32. A zero vector has cosine 0 with everything.
         """
         vectors = unit_rows(vectors)
-        if len(self.descriptors) == 0:  # no width to hold the vectors to
+        if len(self.descriptors) == 0:  # the vectors may have any width
             return np.full((len(self), len(vectors)), NO_EVIDENCE, vectors.dtype)
         cosines = self.descriptors.astype(vectors.dtype, copy=False) @ vectors.T
         return best_of_rows(cosines, self.descriptor_instance, len(self), NO_EVIDENCE)
@@ -152,7 +152,7 @@ _FLOAT_COLUMNS = ("descriptors", "agreement", "visible_area", "reliability")
 
 
 def _as_stored(values: NDArray[Any], kind: type[np.number], what: str) -> NDArray[Any]:
-    """Numbers in the type that files hold; OgPointcloudError for what is no number of that kind."""
+    """Numbers in the type stored in files; OgPointcloudError for values of another kind."""
     if values.dtype.kind not in ("fiu" if issubclass(kind, np.floating) else "iu"):
         raise OgPointcloudError(f"{what} is {values.dtype}; expected {np.dtype(kind)}: convert it")
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinity
@@ -168,7 +168,7 @@ def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> N
         )
     parents = np.append(part_of, -1)  # row -1 is its own parent: none
     ancestor = np.arange(count)
-    # Doubling: after k rounds every row has risen 2^k levels, and none rises more than count.
+    # Pointer doubling: after k rounds every row has risen 2^k levels, and without a cycle none rises more than count.
     for _ in range(count.bit_length()):
         ancestor, parents = parents[ancestor], parents[parents]
     if (ancestor >= 0).any():
@@ -206,7 +206,7 @@ class Vocabulary:
 
 @dataclass(frozen=True, eq=False)
 class WordBank:
-    """Everyday words of the scene's encoder: how a text that does not fit scores, and what else a thing may be.
+    """Everyday words of the scene's encoder: they show how texts that do not fit score, and what else a thing may be.
 
     vectors: (B, D) float32 unit rows, B at least 50; they may be stored as float16.
 
@@ -230,13 +230,13 @@ class WordBank:
 
     @property
     def mean(self) -> NDArray[np.float32]:
-        """(D,) what all words share."""
+        """(D,) mean vector, the component that all words share."""
         return self.vectors.mean(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledCloud:
-    """Points with an instance id each, and one feature row or more per instance.
+    """Points with an instance id each, and one or more descriptors per instance.
 
     xyz: (n, 3) float32, local frame; origin: (3,) float64, world = xyz + origin.
     instance_ids: (n,) int32, >= 0 a row of ``instances``, else BACKGROUND or UNOBSERVED.
@@ -244,13 +244,13 @@ class LabelledCloud:
     spacing: typical distance between neighboring points, in the scene's unit.
     reach: distance from the cloud beyond which a query point is "too far from the map", same unit.
     rgb: (n, 3) uint8 or None.
-    certainty: (n,) uint8, in 255ths, how far views and neighbors bear out that a point is in its instance, or in none;
-    0 where no view saw it. None where that is not known, as in results of others.
-    vocabulary: words that may be asked as strings. word_bank: everyday words of the same encoder, which labels are
-    judged by; without one, answers are not calibrated.
+    certainty: (n,) uint8, in 255ths, how well views and neighbors support that a point is in its instance, or in none;
+    0 if no view saw it. None if not known, as in results of other programs.
+    vocabulary: words that can be given as strings. word_bank: everyday words of the same encoder, by which labels are
+    judged; without one, scores are not calibrated.
     provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
-    cameras: those of the views that it was made from, in the local frame: they tell which space was seen to be empty,
-    so that a later visit is not told that what nobody had looked at is new. Empty where they are not known.
+    cameras: cameras of the views that it was made from, in the local frame. They tell which space was observed to be
+    empty, so that a later visit does not report as new what nobody had looked at before. Empty if not known.
 
     A chair of two points and a desk of one, as if an encoder had two words only:
 
@@ -314,11 +314,13 @@ class LabelledCloud:
             )
         for name in ("spacing", "reach"):
             value = getattr(self, name)
-            if not LENGTHS[0] <= value <= LENGTHS[1]:
-                raise OgPointcloudError(f"{name} is {value}; expected a positive length, {LENGTHS[0]} to {LENGTHS[1]}")
-        if not (np.abs(self.origin) <= FARTHEST).all():
-            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {FARTHEST:g}")
-        space = self.space  # refuses a name that is none
+            if not LENGTH_LIMITS[0] <= value <= LENGTH_LIMITS[1]:
+                raise OgPointcloudError(
+                    f"{name} is {value}; expected a positive length, {LENGTH_LIMITS[0]} to {LENGTH_LIMITS[1]}"
+                )
+        if not (np.abs(self.origin) <= MAX_ORIGIN).all():
+            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {MAX_ORIGIN:g}")
+        space = self.space  # raises if the name is no string
         if self.word_bank is not None:
             space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
 
@@ -327,13 +329,13 @@ class LabelledCloud:
 
     @property
     def space(self) -> FeatureSpace:
-        """The feature space with its width: that of the descriptors, 0 where no instance has one."""
+        """The feature space with the descriptors' width, 0 if no instance has a descriptor."""
         descriptors = self.instances.descriptors
         return FeatureSpace(self.feature_space, descriptors.shape[1] if len(descriptors) else 0)
 
     @property
     def reliability(self) -> float | None:
-        """How good the fit thinks it is, in [0, 1]: `InstanceTable.overall_reliability`; None if unknown."""
+        """The fit's estimate of its own quality, in [0, 1]: `InstanceTable.overall_reliability`; None if unknown."""
         return self.instances.overall_reliability
 
     @property
@@ -345,7 +347,7 @@ class LabelledCloud:
 def unit_rows(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     """Rows of length one, in the vectors' precision, at least float32; a zero row stays zero."""
     vectors = vectors.astype(np.result_type(vectors, np.float32), copy=False)
-    # By the largest component first: squares of tiny or huge ones would leave the float type.
+    # Divided by the largest component first: squares of tiny or huge ones would underflow or overflow.
     largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0)
     scaled = vectors / np.where(largest > 0, largest, 1)
     length = np.linalg.norm(scaled, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Errors the library raises on purpose. Each message holds the value seen, the value expected and the cure."""
+"""Errors that the library raises on purpose. Each message gives the value seen, the value expected and the cure."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """Foreign text as it may be shown: what would move the cursor or reverse the text, and halves of characters, become
-    escapes; beyond ``most`` characters the end is left out.
+    """Untrusted text made safe to show: characters that would move the cursor or reverse the text, and half characters,
+    become escapes; text beyond ``most`` characters is cut.
 
     >>> from og_pointcloud.errors import printable
     >>> printable("mug" + chr(27) + "[2J"), printable("chair" * 9, 12)
@@ -25,7 +25,7 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def coordinate(value: float) -> str:
-    """A coordinate to be read: a tenth of a unit at least, which four digits of a map's 4000123.4 would not be.
+    """A coordinate as text: at least to a tenth of a unit, for which four digits of a map's 4000123.4 do not suffice.
 
     >>> from og_pointcloud.errors import coordinate
     >>> coordinate(0.52314), coordinate(4000123.4321)
@@ -35,7 +35,7 @@ def coordinate(value: float) -> str:
 
 
 def counted(count: int, thing: str) -> str:
-    """So many things, to be read.
+    """A count with its noun, as text.
 
     >>> from og_pointcloud.errors import counted
     >>> counted(1, "scene"), counted(1200, "scene")
@@ -45,18 +45,18 @@ def counted(count: int, thing: str) -> str:
 
 
 def span(points: NDArray[np.floating]) -> str:
-    """The box of points (n, 3) to be read, from..to along x, y and z."""
+    """The extent of points (n, 3) as text, from..to along x, y and z."""
     bounds = zip(points.min(axis=0), points.max(axis=0), strict=True)
     return " x ".join(f"{coordinate(low)}..{coordinate(high)}" for low, high in bounds)
 
 
 def first_line(error: BaseException) -> str:
-    """First line of another library's error, at most 200 characters; its type's name where it says nothing."""
+    """First line of another library's error, at most 200 characters; its type's name if the text is empty."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
-    """Part of a message that names known words like this one, followed by ``then``; "" where there are none.
+    """Part of a message that names known words similar to this one, followed by ``then``; "" if there are none.
 
     >>> from og_pointcloud.errors import did_you_mean
     >>> did_you_mean("table", ["apple", "dining table"]), did_you_mean("aple", ["apple", "dining table"])
@@ -64,9 +64,9 @@ def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
     """
     import difflib  # only when something went wrong
 
-    # Case is the usual slip, and difflib would count each letter of it.
+    # Wrong case is a common slip, and difflib would count each letter of it.
     word, by_lower = word.lower(), {name.lower(): name for name in known}
-    # A dining table is more of a table than an apple is.
+    # Shared words come first: "table" means "dining table" rather than "apple".
     parts = [name for name in by_lower if word in name.split() or name in word.split()]
     close = [by_lower[match] for match in (parts or difflib.get_close_matches(word, by_lower))[:3]]
     return f"; did you mean {' or '.join(repr(name) for name in close)}?{then}" if close else ""
@@ -75,7 +75,7 @@ def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
 class OgPointcloudError(ValueError):
     """Base of all errors raised by og_pointcloud for bad input; the command line prints it as one line.
 
-    The message is printable whatever a file put into it: control characters and half characters become escapes.
+    The message is printable whatever a file contains: control characters and half characters become escapes.
 
     >>> import og_pointcloud as og
     >>> issubclass(og.SceneError, og.OgPointcloudError), issubclass(og.OgPointcloudError, ValueError)
@@ -131,18 +131,18 @@ class MissingExtraError(ImportError):
 
 
 NEEDED_FOR_FITS = ("numba", "scipy", "cv2", "PIL", "tqdm", "onnx")
-"""Modules that stages of a fit or a map import at their top: the extra 'fit'."""
+"""Modules of the extra 'fit' that stages of a fit or a map import at module level."""
 
 
 def missing_extra(error: Exception) -> MissingExtraError | None:
-    """The error to raise where a base install lacks a module that fits or maps need; None for any other error."""
+    """The error to raise if a base install lacks a module that fits or maps need; None for any other error."""
     module = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     return MissingExtraError(module, "fit") if module in NEEDED_FOR_FITS else None
 
 
 @contextmanager
 def naming_extra(module: str, extra: str) -> Iterator[None]:
-    """MissingExtraError, which names the extra, where what is imported inside is not installed."""
+    """Raises MissingExtraError, which names the extra, if an import in the block fails."""
     try:
         yield
     except ImportError as error:

@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 
 
 class LeftOut(Enum):
-    """What can be left out of a fit: its key in provenance, then what it is and why, with places for numbers."""
+    """What a fit can leave out: its key in provenance, then what it is and why, with placeholders for numbers."""
 
     # fmt: off
     COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another lies, and get its label"
@@ -82,21 +82,21 @@ def left_out_entry(key: LeftOut, **numbers: Any) -> dict[str, Any]:
 
 
 def with_bar(items: Iterable[Item], name: str, total: int, shown: bool) -> Iterable[Item]:
-    """The items, with a bar of the remaining time where stderr is a terminal and tqdm is installed. The base install,
-    numpy and onnxruntime, has long work too, and does it without a bar."""
+    """The items, with a progress bar if stderr is a terminal and tqdm is installed. The base install, with numpy and
+    onnxruntime alone, shows no bar."""
     if not shown or find_spec("tqdm") is None:
         return items
     from tqdm import tqdm
 
-    # disable=None: tqdm finds out whether stderr is a terminal.
+    # disable=None: tqdm checks whether stderr is a terminal.
     return tqdm(items, desc=f"{name:<12}", total=total, leave=False, dynamic_ncols=True, disable=None)
 
 
 @dataclass
 class Journal:
-    """What a fit did: seconds per stage, what it left out and why, warnings, notes. Becomes the cloud's provenance.
+    """Record of a fit: seconds per stage, what it left out and why, warnings, notes. Becomes the cloud's provenance.
 
-    progress: show bars with the remaining time where stderr is a terminal.
+    progress: show bars with the remaining time if stderr is a terminal.
     """
 
     progress: bool
@@ -114,7 +114,7 @@ class Journal:
         self.stages.append({"name": name, "seconds": round(seconds, 4)})
 
     def leave_out(self, key: LeftOut, **numbers: Any) -> None:
-        """Note what this scene did not need, or what was not used, with the numbers that its sentence names."""
+        """Record something that this scene did not need or that was not used, with the numbers for its sentences."""
         self.left_out.append((key, numbers))
 
     def steps(self, items: Sequence[Item], name: str) -> Iterable[Item]:
@@ -123,8 +123,8 @@ class Journal:
 
     @contextmanager
     def bars(self) -> Iterator[Callable[[str, int, int, float], None] | None]:
-        """A function to call with a stage's name, the step just done, the number of steps and the loss: it moves a bar.
-        None where none is shown. Needs tqdm, of the extra 'fit'."""
+        """A function that advances a bar, called with a stage's name, the step just done, the number of steps and the
+        loss. None if no bar is shown. Needs tqdm, of the extra 'fit'."""
         if not self.progress:
             yield None
             return
@@ -134,17 +134,17 @@ class Journal:
         with tqdm(leave=False, dynamic_ncols=True, disable=None) as bar:
 
             def report(name: str, step: int, steps: int, loss: float) -> None:
-                if name not in begun:  # one bar, which each stage begins anew
+                if name not in begun:  # one bar, which each stage resets
                     begun.add(name)
                     bar.reset(steps)
                     bar.set_description_str(f"{name:<16}: ", refresh=False)
                 bar.set_postfix(loss=f"{loss:.3g}", refresh=False)
-                bar.update(step - bar.n)  # a training that was taken up begins at a later step
+                bar.update(step - bar.n)  # a resumed training starts at a later step
 
             yield report
 
     def provenance(self, settings: FitSettings) -> dict[str, Any]:
-        """All of it, JSON-able, with the settings it was done with."""
+        """The whole record, JSON-able, with the fit's settings."""
         return {
             "settings": asdict(settings),
             "stages": self.stages,

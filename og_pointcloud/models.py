@@ -1,13 +1,13 @@
-"""ONNX models: found where they were fetched to, checked before they are trusted, opened the same quiet way.
+"""ONNX models: finding fetched ones, checking untrusted ones, and opening sessions.
 
 Nothing is fetched here, and onnxruntime is imported nowhere else.
 
-What a stranger's graph may do is found out from its bytes, before any runtime is given them (`check_graph`).
-onnxruntime reads whatever file of this machine a graph names as the place of its constants, and fills constants of any
-size that a header claims. So a graph passes only if its constants lie in its own bytes, at the length that their shape
-asks for, and its nodes are standard operators: no other domain, no functions, no graphs inside nodes.
+An untrusted graph is checked by its bytes before any runtime gets them (`check_graph`). onnxruntime reads any local
+file that a graph names as the location of its constants, and fills constants of any size that a header claims. So a
+graph passes only if its constants are stored in its own bytes, at the length that their shape requires, and its nodes
+are standard operators: no other domain, no functions, no graphs inside nodes.
 
-Field numbers are those of onnx.proto3, as comments name them; messages are walked over, not copied.
+Field numbers are those of onnx.proto3, named in comments; messages are traversed without copying.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ MANIFEST = "manifest.json"
 MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")
 ERRORS_ONLY = 3
-"""Least severity that onnxruntime logs."""
-MOST_GRAPH_BYTES, LONGEST_RUN_S = 3 << 30, 120.0
-"""Most memory for weights and all that is computed from them, and longest run, seconds; the largest text encoders take
-half of the one, and a second of the other."""
+"""Lowest severity that onnxruntime logs."""
+MAX_GRAPH_BYTES, MAX_RUN_S = 3 << 30, 120.0
+"""Largest memory for weights and all that is computed from them, and longest run in seconds; the largest text encoders
+take half of that memory, and one second."""
 STANDARD_DOMAINS = ("", "ai.onnx")
 TYPE_BYTES = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8, 16: 2}
-"""Bytes an element, by TensorProto.DataType; strings (8), which have no fixed length, are not among them."""
+"""Bytes per element, by TensorProto.DataType; without strings (8), which have no fixed length."""
 VARINT, FIXED_64, BYTES, FIXED_32 = 0, 1, 2, 5
 
 
 def hub_cache() -> Path:
-    """The folder of fetched models, by the variables that Hugging Face's tools go by; it need not exist."""
+    """The folder of fetched models, by the environment variables of Hugging Face's tools; it need not exist."""
     if hub := os.environ.get("HF_HUB_CACHE"):
         return Path(hub)
     home = os.environ.get("HF_HOME")
@@ -55,7 +55,7 @@ def hub_cache() -> Path:
 
 
 def home_folder() -> Path:
-    """The user's home; a path that does not exist for users without one, as in containers run under a bare user id."""
+    """The user's home; a nonexistent path for users without one, as in containers run under a bare user id."""
     try:
         return Path.home()
     except RuntimeError:
@@ -63,11 +63,11 @@ def home_folder() -> Path:
 
 
 def fetched_model(name: str) -> Path | None:
-    """The folder of OWNER/MODEL as it was last fetched; None where it was not, or the name has another form."""
+    """The folder of OWNER/MODEL as last fetched; None if it was not fetched, or the name has another form."""
     if not MODEL_NAME.fullmatch(name):
         return None
     model = hub_cache() / f"models--{name.replace('/', '--')}"
-    # The layout of Hugging Face's cache: refs/main holds the revision, snapshots/REVISION the files.
+    # Layout of the Hugging Face cache: refs/main holds the revision, snapshots/REVISION the files.
     main = model / "refs" / "main"
     revision = main.read_text(encoding="utf-8", errors="replace").strip()[:64] if main.is_file() else ""
     folder = model / "snapshots" / revision
@@ -77,17 +77,17 @@ def fetched_model(name: str) -> Path | None:
 def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
     """A CPU session that leaves the cores idle between runs. model: a serialized ONNX graph.
 
-    bounded: for a stranger's graph. Nothing is computed on opening, and all that such graphs compute shares
-    MOST_GRAPH_BYTES: what asks for more fails.
+    bounded: for an untrusted graph. Nothing is computed on opening, and all such graphs share MAX_GRAPH_BYTES of
+    memory: a run that needs more fails.
     """
-    # Read on import, when it would otherwise write a device id and a usage database into the user's cache folder.
+    # Read on import, which otherwise writes a device id and a usage database into the user's cache folder.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = ERRORS_ONLY
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.enable_mem_pattern = False  # else it keeps one for every number of points that it was ever asked
+    options.enable_mem_pattern = False  # else it keeps one for every number of points that it was ever given
     if bounded:
         _bound_memory()
         options.add_session_config_entry("session.use_env_allocators", "1")
@@ -97,29 +97,29 @@ def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
 
 @cache
 def _bound_memory() -> None:
-    """Make the bounded allocator that all sessions with ``session.use_env_allocators`` share; a process has one."""
+    """Create the process's bounded allocator, shared by all sessions with ``session.use_env_allocators``."""
     import onnxruntime as ort
 
     kind, usual = (ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, ort.OrtMemType.DEFAULT)  # pyright: ignore
     place = ort.OrtMemoryInfo("Cpu", kind, 0, usual)  # pyright: ignore
-    ort.create_and_register_allocator(place, ort.OrtArenaCfg(MOST_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
+    ort.create_and_register_allocator(place, ort.OrtArenaCfg(MAX_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
 
 
 def run_bounded(
     session: InferenceSession, given: Mapping[str, NDArray[Any]], outputs: Sequence[str] | None = None
 ) -> list[Any]:
-    """The outputs that are named, computing only what they need; None: all. TimeoutError after LONGEST_RUN_S. That, or
-    Ctrl-C, stops the run between two nodes."""
+    """The named outputs, computing only what they need; None: all. TimeoutError after MAX_RUN_S. A timeout or Ctrl-C
+    stops the run between two nodes."""
     import onnxruntime
 
     options: Any = onnxruntime.RunOptions()
     options.log_severity_level = ERRORS_ONLY + 1
     options.only_execute_path_to_fetches = outputs is not None
-    # In a thread of its own: this one can then stop waiting, and set `terminate`, which onnxruntime looks at.
+    # In a separate thread: this one can then stop waiting, and set `terminate`, which onnxruntime checks.
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(session.run, outputs, dict(given), options)
         try:
-            return list(answer.result(LONGEST_RUN_S))
+            return list(answer.result(MAX_RUN_S))
         except BaseException:
             options.terminate = True
             raise
@@ -127,10 +127,10 @@ def run_bounded(
 
 @dataclass(frozen=True)
 class EncoderFormat:
-    """A kind of folder that ``og-pointcloud export`` writes; it may come from a stranger.
+    """A kind of folder that ``og-pointcloud export`` writes; such folders are untrusted.
 
-    name, version: ``format`` and ``schema_version`` of its manifest.json. graph: the ONNX graph's file, and operators,
-    all that it is made of. command: what makes such a folder. more: further files, and the bytes that each may have.
+    name, version: ``format`` and ``schema_version`` of its manifest.json. graph: the ONNX graph's file. operators:
+    those that the graph may use. command: makes such a folder. more: further files, with the maximum bytes of each.
     optional: one of them that may be absent.
     """
 
@@ -144,16 +144,16 @@ class EncoderFormat:
 
     @property
     def files(self) -> dict[str, int]:
-        """All files, and the bytes that each may have; a serialized graph cannot have more."""
+        """All files, with the maximum bytes of each; a serialized graph cannot have more."""
         return {MANIFEST: 1 << 20, self.graph: (1 << 31) - 1, **self.more}
 
     @property
     def remake(self) -> str:
-        """The cure that errors end in."""
+        """The cure at the end of error texts."""
         return f"make the encoder again with {self.command}"
 
     def read(self, folder: Path) -> dict[str, bytes]:
-        """The bytes of a folder's files, unchecked but for their size; OgPointcloudError where one is missing."""
+        """The bytes of a folder's files, with only their size checked; OgPointcloudError if one is missing."""
         present = [name for name in self.files if name != self.optional or (folder / name).is_file()]
         return {name: self._bounded(folder / name) for name in present}
 
@@ -163,14 +163,14 @@ class EncoderFormat:
             with path.open("rb") as file:
                 size = os.fstat(file.fileno()).st_size
                 if size <= most:
-                    return file.read(size)  # not the bound, which it would allocate
+                    return file.read(size)  # not the limit, which it would allocate
         except FileNotFoundError:
             raise OgPointcloudError(f"{path} is missing: {self.remake}") from None
         raise OgPointcloudError(f"{path} has {size}, more than {most} bytes: {self.remake}")
 
     def checked(self, files: Mapping[str, bytes], where: str, take: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-        """The manifest, if all fits together. take: reads its other fields; its KeyError, TypeError and ValueError say
-        what is wrong. OgPointcloudError begins with ``where``."""
+        """The manifest, if all files are consistent. take: checks its other fields, and raises KeyError, TypeError or
+        ValueError. OgPointcloudError, whose text begins with ``where``, says what is wrong."""
         try:
             for name, data in files.items():
                 if len(data) > self.files[name]:
@@ -181,7 +181,7 @@ class EncoderFormat:
                 raise ValueError(f"its format is {stated!r:.60}; expected {self.name!r} {self.version}")
             needed = {*self.files} - {self.optional}
             for name in sorted((needed | {*files, *manifest["files"]}) - {MANIFEST}):
-                # Not the sha256 beside it: eight times as slow, and who can change a file can change its manifest.
+                # Not its sha256: eight times as slow, and whoever can change a file can change its manifest.
                 if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
                     raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
             check_graph(files[self.graph], self.operators)
@@ -193,7 +193,7 @@ class EncoderFormat:
         return manifest
 
     def feature_space(self, folder: Path) -> str | None:
-        """What a folder's manifest says; None where it has none that can be read, as other folders may lie here too."""
+        """The feature space in a folder's manifest; None without a readable one: unrelated folders may lie here too."""
         try:
             manifest = json.loads(self._bounded(folder / MANIFEST))
         except (OgPointcloudError, OSError, ValueError, RecursionError):
@@ -202,7 +202,7 @@ class EncoderFormat:
         return manifest.get("feature_space") if ours else None
 
     def find(self, feature_space: str, folders: Sequence[Path]) -> Path | None:
-        """The first encoder of a feature space among folders that may be one, or hold some."""
+        """The first encoder of a feature space among folders that may be encoders, or contain some."""
         for folder in folders:
             inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
             for candidate in (folder, *inside):
@@ -213,9 +213,9 @@ class EncoderFormat:
     def vectors(
         self, session: InferenceSession, given: NDArray[Any], shape: tuple[int, ...], where: str, output: str = ""
     ) -> NDArray[np.float32]:
-        """The graph's output for its one input: finite float32 of that shape. output: its name, "" for the first.
+        """The graph's output for its only input: finite float32 of this shape. output: its name, "" for the first.
 
-        OgPointcloudError, which begins with ``where``, for a graph that fails or answers anything else.
+        OgPointcloudError, whose text begins with ``where``, for a graph that fails or returns anything else.
         """
         try:
             outputs = [output or session.get_outputs()[0].name]
@@ -235,7 +235,7 @@ class EncoderFormat:
 def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
     """ValueError, which says why, for a graph that is damaged or may do more than compute with its own constants.
 
-    operators: those that it may use; None for any of the standard.
+    operators: the allowed operators; None for all standard ones.
     """
     for number, value in message_fields(memoryview(model)):
         if number == 25:  # ModelProto.functions
@@ -283,7 +283,7 @@ class Constant(NamedTuple):
 
 
 def constant_of(tensor: memoryview | int) -> Constant:
-    """A TensorProto; ValueError unless it is stored as plain bytes, at the length that its shape asks for."""
+    """A TensorProto; ValueError unless it is stored as plain bytes, at the length that its shape requires."""
     shape: list[int] = []
     kind, data, typed = 0, memoryview(b""), False
     for number, value in message_fields(tensor):
@@ -305,7 +305,7 @@ def constant_of(tensor: memoryview | int) -> Constant:
 
 
 def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
-    """(field number, value) of a protobuf message, in order: an int of a varint, else its bytes, not copied."""
+    """(field number, value) of a protobuf message, in order: an int for a varint, else the bytes, not copied."""
     message = _message(message)
     position, end = 0, len(message)
     while position < end:
@@ -352,13 +352,13 @@ def _message(value: memoryview | int) -> memoryview:
 
 
 def text_of(message: memoryview | int, number: int) -> str:
-    """A message's field of this number as text, "" without one; of several the last counts, as in protobuf."""
+    """A message's field of this number as text, "" if absent; if repeated, the last one, as in protobuf."""
     fields = [value for found, value in message_fields(message) if found == number]
     return bytes(_message(fields[-1])).decode("utf-8", "replace") if fields else ""
 
 
 def integers_of(value: memoryview | int) -> list[int]:
-    """A repeated int64, which may come one by one or packed."""
+    """A repeated int64, which may be stored one by one or packed."""
     if isinstance(value, int):
         return [_signed(value)]
     numbers, position = [], 0

@@ -1,11 +1,11 @@
-"""What training reads: points and views. This file is the only statement of frames and units.
+"""The input of training: points and views. This file defines all frames and units.
 
 Frames. Cameras are OpenCV (x right, y down, z forward); ``world_to_camera`` maps local world coordinates to the
 camera. Pixel (row i, column j) has its center at (j + 0.5, i + 0.5). World coordinates are ``local + origin``:
-the origin (float64) takes map offsets of 1e6 away so that everything after reading works in float32 near zero.
+the origin (float64) removes map offsets of 1e6, so that everything after reading works in float32 near zero.
 
-Units. Whatever the capture uses; no threshold of the library is a length, all are multiples of the point spacing
-or shares of the scene extent.
+Units. Whatever the capture uses; no threshold of the library is an absolute length, all are multiples of the point
+spacing or shares of the scene extent.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
-SHORTEST_FOCAL = 1e-6
-"""Focal length over the image's side: shorter ones see half of the world in every pixel."""
-LONGEST_SIDE = 1 << 17
-"""Pixels; no camera has more."""
+MIN_FOCAL_SHARE = 1e-6
+"""Smallest focal length as a share of the image's side: with a shorter one every pixel sees half of the world."""
+MAX_SIDE_PX = 1 << 17
+"""Largest side of an image; no camera has more."""
 NOT_SEEN = -2
-"""In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
-FEW = 12
-"""Arrays and tuples of up to so many values are shown whole by a record's repr."""
-RIGID = 1e-2
-"""How far a rotation's rows may be from length one and from right angles, in any entry of R R' - 1."""
+"""In a mask map: a pixel that the lens did not see, which tells nothing; -1 tells that no mask is there."""
+MAX_VALUES_SHOWN = 12
+"""A record's repr shows arrays and tuples of up to this many values in full."""
+ROTATION_TOLERANCE = 1e-2
+"""Largest deviation of a rotation's rows from orthonormality, in any entry of R R' - 1."""
 UNIT_TOLERANCE = 1e-3
-"""A quaternion's length may differ from 1 by this much; it scales a Gaussian by its square, twice as much."""
+"""Largest deviation of a quaternion's length from 1; it scales a Gaussian by its square, so by twice this share."""
 
 
 def brief(self: Any) -> str:
-    """The repr of a dataclass whose fields would fill pages: arrays as type and shape, long tuples as their length.
+    """A short repr of a dataclass with large fields: arrays as type and shape, long tuples as their length.
 
     >>> import numpy as np
     >>> from og_pointcloud.scene import Points
@@ -52,15 +52,17 @@ def brief(self: Any) -> str:
 
 
 def _brief(value: Any) -> str:
-    if isinstance(value, np.ndarray) and value.size > FEW:
+    if isinstance(value, np.ndarray) and value.size > MAX_VALUES_SHOWN:
         return f"<{value.dtype} {value.shape}>"
-    if isinstance(value, dict) or (isinstance(value, tuple) and (len(value) > FEW or any(map(is_dataclass, value)))):
+    if isinstance(value, dict) or (
+        isinstance(value, tuple) and (len(value) > MAX_VALUES_SHOWN or any(map(is_dataclass, value)))
+    ):
         return f"<{len(value)}>"
     return "<read when asked for>" if callable(value) else repr(value)
 
 
 def take_arrays(record: Any, *names: str) -> None:
-    """Make arrays of what a frozen record was given as lists, in these of its fields; SceneError for ragged ones."""
+    """Convert lists in these fields of a frozen record to arrays; SceneError for ragged ones."""
     for name in names:
         value = getattr(record, name)
         if isinstance(value, list | tuple):
@@ -71,8 +73,8 @@ def take_arrays(record: Any, *names: str) -> None:
 
 
 def numbers_of(value: Any) -> NDArray[Any]:
-    """np.asarray that takes torch's tensors too; of no array, such as rows of different lengths, a scalar None, which
-    fits no expected shape."""
+    """np.asarray that also takes torch tensors; for a value that is no array, such as rows of different lengths, a
+    scalar None, which matches no expected shape."""
     of_torch = any(kind.__module__.partition(".")[0] == "torch" for kind in type(value).__mro__)
     try:
         return np.asarray(dense_tensor(value) if of_torch else value)
@@ -81,7 +83,7 @@ def numbers_of(value: Any) -> NDArray[Any]:
 
 
 def dense_tensor(tensor: Any) -> NDArray[Any] | None:
-    """A torch tensor as an array, wherever it lies; None for what is none, or is sparse."""
+    """A torch tensor on any device as an array; None for a sparse tensor or anything else."""
     try:
         tensor = tensor.detach().cpu()
         return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
@@ -119,23 +121,23 @@ class Camera:
         if not all(isinstance(number, Real) for number in numbers):
             raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers of pixels")
         error, determinant = rotation_error(pose[:3, :3])
-        if not error <= RIGID or determinant < 0:  # also where the error is NaN
+        if not error <= ROTATION_TOLERANCE or determinant < 0:  # also where the error is NaN
             raise SceneError(
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
-        # Sizes come before focal lengths, which are held against them.
-        if not all(1 <= side <= LONGEST_SIDE and side == int(side) for side in (self.width, self.height)):
+        # Sizes are checked before focal lengths, which are compared with them.
+        if not all(1 <= side <= MAX_SIDE_PX and side == int(side) for side in (self.width, self.height)):
             raise SceneError(
                 f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
-                f"most {LONGEST_SIDE} a side, in whole numbers: check w and h of the pose file"
+                f"most {MAX_SIDE_PX} a side, in whole numbers: check w and h of the pose file"
             )
         for name in ("width", "height"):
-            object.__setattr__(self, name, int(getattr(self, name)))  # 64.0 is no shape
-        if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
+            object.__setattr__(self, name, int(getattr(self, name)))  # 64.0 cannot be a shape
+        if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < MIN_FOCAL_SHARE:
             raise SceneError(
                 f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, fx and fy > 0 "
-                f"by {SHORTEST_FOCAL:g} of the image's sides or more: check the camera model in the pose file"
+                f"by {MIN_FOCAL_SHARE:g} of the image's sides or more: check the camera model in the pose file"
             )
 
     def resized(self, width: int, height: int) -> Camera:
@@ -147,20 +149,20 @@ class Camera:
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def project(self, xyz: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
-        """Where points appear: uv_px (n, 2) column and row, pixel centers at +0.5, and depth (n,) along the view axis.
+        """Project points: uv_px (n, 2) column and row, pixel centers at +0.5, and depth (n,) along the view axis.
 
-        xyz: (n, 3) in the frame that ``world_to_camera`` starts from. Computed in float64. Points that are not before
-        the camera (depth <= 0) have NaN for uv_px, which no comparison takes for a pixel; points beside the image have
-        the pixel they would have in a wider one.
+        xyz: (n, 3) in the frame that ``world_to_camera`` maps from. Computed in float64. Points that are not in front
+        of the camera (depth <= 0) have NaN for uv_px, which compares false with everything; points outside the image
+        have the pixel they would have in a larger one.
         """
         in_camera = xyz @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         x, y, depth = in_camera.T
-        # NaN, not a division by a depth <= 0, which would mirror what is behind the camera into the image.
+        # NaN, since division by a depth <= 0 would mirror points behind the camera into the image.
         in_front = np.where(depth > 0, depth, np.nan)
         return np.stack([self.fx * x / in_front + self.cx, self.fy * y / in_front + self.cy], axis=1), depth
 
     def shows(self, uv_px: DoubleArray) -> NDArray[np.bool_]:
-        """(n,) bool: which of `project`'s pixel coordinates (n, 2) fall into the image; NaN does not."""
+        """(n,) bool: which pixel coordinates (n, 2) of `project` lie in the image; NaN does not."""
         u, v = uv_px.T
         return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
 
@@ -178,9 +180,9 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class CutMasks:
-    """For a view that is one of several cut from a photograph: its masks are parts of the photograph's.
+    """Origin of the masks of a view that is one of several cut from a photograph: parts of the photograph's masks.
 
-    photograph: its name. rows: (M,) int64, which of its masks each mask of the view is a part of.
+    photograph: its name. rows: (M,) int64, the photograph's mask that each mask of the view is a part of.
     """
 
     photograph: str
@@ -193,13 +195,12 @@ class View:
 
     name: the image's file stem, unique in the scene.
     masks: (H, W) int32, -1 outside every mask, NOT_SEEN where the photograph shows nothing (beyond a lens's rim), else
-        a row of ``mask_features``; or a function that reads it, so that a long capture is streamed. H, W are the
-        camera's.
+        a row of ``mask_features``; or a function that reads it, so that long captures are streamed. H, W of the camera.
     mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalized).
     image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
-    mask_tracks: (M,) integers, which masks of other views a tracker took for the same thing: equal numbers, -1 unknown;
-        None where there was no tracker.
-    cut_from: the photograph whose masks these are parts of; None where they are masks of this view.
+    mask_tracks: (M,) integers, a tracker's id of the thing in each mask, equal for the same thing in all views, -1
+        unknown; None without a tracker.
+    cut_from: the photograph whose masks these are parts of; None if they are masks of this view.
     """
 
     name: str
@@ -320,7 +321,7 @@ class Points:
         if len(world) == 0:
             raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
         require_finite(world)
-        origin = np.median(world, axis=0)  # where the points are: a few far ones do not move it, and cost no digits
+        origin = np.median(world, axis=0)  # a few outliers do not move it away from the points, which would cost digits
         extent = float(np.abs(world - origin).max())
         if extent > float(np.finfo(np.float32).max):
             raise SceneError(
@@ -346,7 +347,7 @@ class Points:
                 raise SceneError(f"{name} has shape {value.shape}; expected {expected}")
         if self.rgb is not None and self.rgb.dtype != np.uint8:
             raise SceneError(f"rgb is {self.rgb.dtype}; expected uint8: scale colors to 0..255 and convert them")
-        # Half a Gaussian would be drawn as nothing or as anything.
+        # An incomplete Gaussian cannot be rendered.
         given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
@@ -358,7 +359,7 @@ class Points:
         return len(self.xyz)
 
     def take(self, rows: NDArray[np.integer]) -> Points:
-        """The points of these rows, in their order, with all that is known of them."""
+        """The points of these rows, in their order, with all attributes."""
         names = ("rgb", "scale", "rotation", "opacity")
         columns: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen = {name: None if column is None else column[rows] for name, column in columns.items()}
@@ -383,7 +384,7 @@ class Points:
 
 
 def pose_matrix(pose: ArrayLike, what: str = "pose", cure: str = ", cloud to world") -> DoubleArray:
-    """A pose (4, 4) as float64, a copy. SceneError, which calls it ``what``, for numbers that are not finite and a last
+    """A pose (4, 4) as a float64 copy. SceneError, which calls it ``what``, for numbers that are not finite or a last
     row other than 0 0 0 1."""
     matrix = numbers_of(pose)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
@@ -404,8 +405,8 @@ def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
 
 
 def float32_step(xyz_world: NDArray[np.floating]) -> float:
-    """How far apart float32 numbers lie about most of some points (n, 3), finite ones, if all of their coordinates are
-    such numbers, as those of a map that a program kept as float32; else 0."""
+    """Spacing of float32 numbers at the median magnitude of finite points (n, 3), if all their coordinates are float32
+    numbers, as in a map that a program stored as float32; else 0."""
     with np.errstate(over="ignore"):
         single = xyz_world.astype(np.float32)
     if single.size == 0 or not np.array_equal(single, xyz_world):
@@ -414,10 +415,10 @@ def float32_step(xyz_world: NDArray[np.floating]) -> float:
 
 
 def rounded_pose(pose: ArrayLike, spacing: float) -> str:
-    """Why a pose (4, 4) is too coarse for points that lie ``spacing`` apart, having been kept as float32 among map
-    coordinates; "" where it is not."""
+    """Why a pose (4, 4) that was stored as float32 in map coordinates is too coarse for points ``spacing`` apart; "" if
+    it is not."""
     matrix = numbers_of(pose)
-    # Whole numbers, as of an offset that someone chose, tell nothing; a turn whose numbers are all float32's does.
+    # Whole numbers, as in a chosen offset, tell nothing; a rotation whose entries are all float32 numbers does.
     fractions = matrix if matrix.dtype == np.float32 else matrix[:3, :3]
     step = float32_step(matrix.reshape(1, -1)) if (fractions % 1).any() else 0.0
     if step <= spacing:
@@ -439,7 +440,7 @@ def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the 
 
 
 def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
-    """Readers of files activate scales and opacities and normalize quaternions; here what others made is checked."""
+    """Check Gaussians made by callers; file readers already activate scales and opacities and normalize quaternions."""
     fits = np.logical_and.reduce((scale >= 0) & (scale < np.inf), axis=1)
     _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
     fits = np.logical_and(opacity >= 0, opacity <= 1)
@@ -457,8 +458,8 @@ def _require(fits: NDArray[np.bool_], values: FloatArray, name: str, expected: s
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Points and the views of them, which may come from any iterable. feature_space names the encoder of the mask
-    features, e.g. ``clip-vit-b32``."""
+    """Points and their views, from any iterable. feature_space: name of the mask features' encoder, e.g.
+    ``clip-vit-b32``."""
 
     points: Points
     views: tuple[View, ...]
@@ -480,7 +481,7 @@ class Scene:
                 f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd}); expected one width: "
                 "encode all masks with the same model"
             )
-        # Views are told apart by name wherever something is kept of them: work folders, tables, messages.
+        # Views are identified by name wherever something about them is stored: work folders, tables, messages.
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
             twice = next(name for name in names if names.count(name) > 1)

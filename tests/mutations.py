@@ -326,7 +326,7 @@ MUTATIONS = (
     ),
     Mutation(
         "lengths of any size are believed", "cloud.py",
-        "if not LENGTHS[0] <= value <= LENGTHS[1]:", "if not value > 0:",
+        "if not LENGTH_LIMITS[0] <= value <= LENGTH_LIMITS[1]:", "if not value > 0:",
         trust("lengths_whose_squares_are_no_numbers"),
     ),
     Mutation(
@@ -360,11 +360,11 @@ MUTATIONS = (
     ),
     Mutation(
         "texts may grow", "text/tokenizer.py",
-        "if growth > MOST_GROWTH:", "if growth < 0:", trust("tokenizers_that_would_grow_without_end"),
+        "if growth > MAX_GROWTH:", "if growth < 0:", trust("tokenizers_that_would_grow_without_end"),
     ),
     Mutation(
         "pieces of any length", "text/tokenizer.py",
-        "if longest > LONGEST_PIECE or", "if", trust("tokenizers_that_would_grow_without_end"),
+        "if longest > MAX_PIECE_CHARACTERS or", "if", trust("tokenizers_that_would_grow_without_end"),
     ),
     Mutation(
         "a plan of memory for every size of frame", "models.py",

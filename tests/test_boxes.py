@@ -181,7 +181,7 @@ def test_map_coordinates_cost_their_rounding_alone():
 def test_boxes_of_many_sets_are_those_of_each_and_nearly_the_least(up, monkeypatch):
     """Sets of one point to hundreds, in any order, are worked out a few at a time, padded to the longest of these."""
     random = np.random.default_rng(5)
-    monkeypatch.setattr(boxes, "PRODUCTS_AT_ONCE", 1 << 17)
+    monkeypatch.setattr(boxes, "MAX_PRODUCTS", 1 << 17)
     sets = [random.normal(size=(count, 3)) * random.choice([0.1, 1, 10], 3)
             for count in random.permutation([1, 1, 2, 3, 4, 7, 20, 20, 21, 30, 60, 61, 200, 900])]  # fmt: skip
     together = boxes.oriented_boxes(sets, up)

@@ -41,7 +41,8 @@ def front_points_plainly(cloud, camera):
             across = column - math.floor(camera.fx * x / depth + camera.cx)
             down = row - math.floor(camera.fy * y / depth + camera.cy)
             half = min(
-                round(picking.HALF_WIDTH * np.sqrt(camera.fx * camera.fy) * cloud.spacing / depth), picking.WIDEST
+                round(picking.HALF_SIDE_SPACINGS * np.sqrt(camera.fx * camera.fy) * cloud.spacing / depth),
+                picking.MAX_HALF_SIDE_PX,
             )
             if max(abs(across), abs(down)) <= half:
                 covering.append((across**2 + down**2, across, down, depth, point))

@@ -28,7 +28,7 @@ from og_pointcloud_export.query_graph import build_query_graph
 from test_choosing import Made
 
 import og_pointcloud as og
-from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.bundle.format import BEYOND_REACH, NEAR_SURFACE, ON_SURFACE
 from og_pointcloud.bundle.known_graph import query_tables
 from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import WordBank
@@ -97,7 +97,7 @@ def test_beyond_the_grid_is_certainly_too_far_unless_points_lie_there():
 
 def test_far_outliers_do_not_grow_the_table():
     room_grid, outlier_grid = (build_lookup_grid(CLOUDS[name]) for name in ("room", "far outliers"))
-    assert outlier_grid.blocks.size <= lookup_grid.BLOCKS_AT_LEAST
+    assert outlier_grid.blocks.size <= lookup_grid.MIN_BLOCK_BUDGET
     assert len(outlier_grid.nodes) <= 2 * len(room_grid.nodes)
 
 
@@ -106,7 +106,7 @@ def test_a_table_over_its_budget_of_nodes_leaves_boxes_open_and_stays_right(monk
     cloud = CLOUDS["room"]
     points = queries(cloud, 300)
     full = run(cloud, points, texts(cloud))
-    monkeypatch.setattr(lookup_grid, "NODES_AT_LEAST", nodes)
+    monkeypatch.setattr(lookup_grid, "MIN_NODE_BUDGET", nodes)
     monkeypatch.setattr(lookup_grid, "NODES_PER_POINT", 0)
     small = run(cloud, points, texts(cloud))
     assert len(build_lookup_grid(cloud).nodes) == nodes + 1  # and the row for lists
@@ -137,7 +137,7 @@ def test_without_lists_the_center_of_a_box_answers_for_it(monkeypatch):
     cloud = CLOUDS["room"]
     points = cloud.xyz + np.float32(0.3 * cloud.spacing) * np.random.default_rng(0).normal(size=cloud.xyz.shape)
     exact = instances_plainly(cloud, points.astype(np.float32))
-    monkeypatch.setattr(lookup_grid, "LISTS_AT_LEAST", 0)
+    monkeypatch.setattr(lookup_grid, "MIN_LIST_BUDGET", 0)
     monkeypatch.setattr(lookup_grid, "LISTS_PER_POINT", 0)
     table = run(cloud, points, texts(cloud))
     assert 0.2 < table["certain"].mean() < 1
@@ -148,7 +148,7 @@ def test_without_lists_the_center_of_a_box_answers_for_it(monkeypatch):
 def test_lists_over_their_budget_leave_boxes_open_and_every_answer_right(monkeypatch):
     cloud = CLOUDS["room"]
     points = queries(cloud, 300)
-    monkeypatch.setattr(lookup_grid, "LISTS_AT_LEAST", 100)
+    monkeypatch.setattr(lookup_grid, "MIN_LIST_BUDGET", 100)
     monkeypatch.setattr(lookup_grid, "LISTS_PER_POINT", 0)
     monkeypatch.setattr(lookup_grid, "BOXES_PER_CHUNK", 1)  # a budget ends with the chunk that uses it up
     assert 100 <= (build_lookup_grid(cloud).child_length > 0).sum() < 100 + CHILDREN
@@ -162,7 +162,7 @@ def test_a_graph_has_no_more_bytes_than_a_file_can_and_stays_right(monkeypatch, 
     cloud = CLOUDS["room"]
     points = queries(cloud, 300)
     most = int(share * len(build_query_graph(cloud, build_lookup_grid(cloud))))
-    monkeypatch.setattr(lookup_grid, "MOST_BYTES", most)
+    monkeypatch.setattr(lookup_grid, "MAX_TABLE_BYTES", most)
     monkeypatch.setattr(lookup_grid, "BOXES_PER_CHUNK", 1)
     without_tables = 25_000
     assert len(build_query_graph(cloud, build_lookup_grid(cloud))) < most + without_tables
@@ -267,7 +267,7 @@ def test_queries_where_very_many_points_lie_are_settled_in_parts(monkeypatch):
     found = run(cloud, points, texts(cloud))
     assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
     assert found["certain"].mean() > 0.2
-    monkeypatch.setattr(lookup_grid, "NODES_AT_LEAST", 60)  # bricks alone: lists of cells do not hold so many
+    monkeypatch.setattr(lookup_grid, "MIN_NODE_BUDGET", 60)  # bricks alone: lists of cells do not hold so many
     monkeypatch.setattr(lookup_grid, "NODES_PER_POINT", 0)
     assert run(cloud, points, texts(cloud))["certain"].mean() < 0.1
 
@@ -280,7 +280,7 @@ def test_of_coincident_points_one_is_kept():
 def test_lists_have_at_most_so_many_candidates():
     cloud = make_cloud(np.random.default_rng(6).random((4000, 3)) * 0.12, np.arange(4000) % 5)
     grid, points = build_lookup_grid(cloud), queries(cloud, 300)
-    assert grid.child_length.max() <= lookup_boxes.LONGEST_LIST
+    assert grid.child_length.max() <= lookup_boxes.MAX_LIST_LENGTH
     found = run(cloud, points, texts(cloud))
     assert 0 < found["certain"].mean() < 1
     assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
@@ -292,18 +292,18 @@ def test_distance_is_surface_near_or_beyond():
     points = queries(cloud, 400)[:1200]
     found = run(cloud, points, texts(cloud))
     true = np.linalg.norm(points[:, None].astype(np.float64) - cloud.xyz, axis=2).min(axis=1)
-    assert ((found["distance"] == BEYOND) == (found["instance"] == TOO_FAR)).all()
-    assert ((found["distance"] == BEYOND) == (true > cloud.reach)).all()
+    assert ((found["distance"] == BEYOND_REACH) == (found["instance"] == TOO_FAR)).all()
+    assert ((found["distance"] == BEYOND_REACH) == (true > cloud.reach)).all()
     # Between the first two, a cell's center speaks for the cell.
     half_diagonal, surface = cell * np.sqrt(3) / 2, surface_distance(cloud.spacing, cloud.reach)
     assert (found["distance"][true <= surface - half_diagonal] == ON_SURFACE).all()
-    assert (found["distance"][(true > surface + half_diagonal) & (true <= cloud.reach)] == NEAR).all()
-    assert set(found["distance"].tolist()) == {ON_SURFACE, NEAR, BEYOND}
+    assert (found["distance"][(true > surface + half_diagonal) & (true <= cloud.reach)] == NEAR_SURFACE).all()
+    assert set(found["distance"].tolist()) == {ON_SURFACE, NEAR_SURFACE, BEYOND_REACH}
 
 
 def test_a_table_without_any_box_is_all_open(monkeypatch):
     cloud = CLOUDS["room"]
-    monkeypatch.setattr(lookup_grid, "BRICKS_PER_AXIS", 0)
+    monkeypatch.setattr(lookup_grid, "MAX_BRICKS_PER_AXIS", 0)
     assert not run(cloud, [[1e6, 0, 0]], texts(cloud))["certain"].any()
 
 

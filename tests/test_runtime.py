@@ -714,7 +714,7 @@ def test_a_shorter_reach_is_exact(scene):
 
 @pytest.mark.parametrize("name", ["room", "far outliers", "coincident points of different ids", "scattered points"])
 def test_points_that_the_table_leaves_open_are_settled_exactly(monkeypatch, tmp_path, name):
-    monkeypatch.setattr(lookup_grid, "LISTS_AT_LEAST", 0)
+    monkeypatch.setattr(lookup_grid, "MIN_LIST_BUDGET", 0)
     monkeypatch.setattr(lookup_grid, "LISTS_PER_POINT", 0)
     cloud = CLOUDS[name]
     scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))

@@ -113,8 +113,8 @@ def test_beside_pictures_an_answer_waits_for_the_picture(pages, live, page, monk
 def test_a_browser_that_has_left_before_it_is_welcomed_gets_no_screen(page):
     """Both are told from threads, in any order; what is kept for it would never be let go."""
     gone = SimpleNamespace(client_id=7)
-    page._left(gone)
-    page._came(gone)
+    page._client_left(gone)
+    page._client_connected(gone)
     assert page._screens == {}
 
 
@@ -349,7 +349,7 @@ def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
 
 def test_while_the_view_turns_a_picture_is_of_fewer_points(shown_in, monkeypatch):
     drawn = []
-    monkeypatch.setattr("og_pointcloud.show.screen.TURNING_POINTS", 200)
+    monkeypatch.setattr("og_pointcloud.show.screen.TURNING_VIEW_POINTS", 200)
     monkeypatch.setattr(
         "og_pointcloud.show.screen.front_points",
         lambda points, camera: drawn.append(points) or front_points(points, camera),
@@ -365,7 +365,7 @@ def test_while_the_view_turns_a_picture_is_of_fewer_points(shown_in, monkeypatch
 
 def test_a_timing_of_points_that_were_replaced_changes_nothing(pages, monkeypatch):
     """The scene is changed and changed back while the first timing waits for the browser."""
-    from og_pointcloud.show.screen import PROBES, Screen
+    from og_pointcloud.show.screen import PROBE_COUNT, Screen
 
     browser, timed, asked, hold = Browser(monkeypatch, 0.9, 0.1), threading.Semaphore(0), [], threading.Event()
     monkeypatch.setattr(Screen, "_time", lambda *args, time=Screen._time: (time(*args), timed.release()))
@@ -388,7 +388,7 @@ def test_a_timing_of_points_that_were_replaced_changes_nothing(pages, monkeypatc
         hold.set()
         assert all(timed.acquire(timeout=60) for _ in range(3))
         assert (screen.sends_pictures, browser.drawn.visible) == (True, False)
-        assert len(asked) == 1 + 2 * PROBES  # a picture for each timing at once would hold up the others
+        assert len(asked) == 1 + 2 * PROBE_COUNT  # a picture for each timing at once would hold up the others
     finally:
         screen.close()
 
@@ -419,7 +419,7 @@ def test_a_picture_that_comes_late_is_in_the_colors_of_now(shown_in):
     live, browser, screen = shown_in(0.9, 0.1)
     until(lambda: browser.pictures)
     until(lambda: browser.background is not None)
-    late = screen._behind
+    late = screen._background_timer
     live.ask("plum")
     screen.paint(live.colors())
     late.function(*late.args)  # it had fired, and waited for its turn
@@ -429,7 +429,7 @@ def test_a_picture_that_comes_late_is_in_the_colors_of_now(shown_in):
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", ["points", "pictures"])
 def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(pages, window, monkeypatch, sent):
-    monkeypatch.setattr("og_pointcloud.show.screen.SLOW_S", np.inf if sent == "points" else -np.inf)
+    monkeypatch.setattr("og_pointcloud.show.screen.SLOW_BROWSER_S", np.inf if sent == "points" else -np.inf)
     # Two plates, one above the other in the picture, each an instance of its own and of one color.
     plate = np.stack(np.meshgrid(np.arange(0, 2, 0.02), np.arange(0, 0.9, 0.02)), axis=-1).reshape(-1, 2)
     xyz = np.concatenate([np.c_[plate, np.zeros(len(plate))], np.c_[plate + np.array([0, 1.1]), np.zeros(len(plate))]])

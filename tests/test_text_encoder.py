@@ -71,9 +71,9 @@ def test_a_text_is_encoded_once(encoder, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(encoder.__dict__, "_session", None)
         assert (encoder.encode(["low", "cat"]) == first[[1, 0]]).all()
-    monkeypatch.setattr("og_pointcloud.text.encoder.VECTORS_REMEMBERED", 1)
+    monkeypatch.setattr("og_pointcloud.text.encoder.MAX_CACHED_VECTORS", 1)
     encoder.encode(["cat"])
-    assert list(encoder._remembered) == ["cat"]
+    assert list(encoder._cache) == ["cat"]
 
 
 def test_threads_share_an_encoder(encoder, encoder_folder):

@@ -193,7 +193,7 @@ def test_what_an_encoder_computes_is_bounded_in_memory():
 
 
 def test_what_an_encoder_computes_is_bounded_in_time(monkeypatch):
-    monkeypatch.setattr("og_pointcloud.models.LONGEST_RUN_S", 0.2)
+    monkeypatch.setattr("og_pointcloud.models.MAX_RUN_S", 0.2)
     encoder = TextEncoder(encoder_with(graph=encoder_graph(OUT, "long")), "evil")
     with pytest.raises(OgPointcloudError, match=r"does not run \(TimeoutError\)"):
         encoder(["cat"])

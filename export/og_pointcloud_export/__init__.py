@@ -1,8 +1,8 @@
-"""All that writes what travels, and needs onnx or numba to do it; what reads it again is in ``og_pointcloud``.
+"""Writers of portable files, which need onnx or numba; the readers are in ``og_pointcloud``.
 
-``writer``: a LabelledCloud -> one .ogpc file, checked against float64. ``query_graph``: the graph in it that answers
-text for points; ``lookup_grid`` and ``lookup_boxes``: the table by which that graph finds the nearest point's instance.
-Further, text and image models -> the ONNX folders that encode words and masks.
+``writer``: a LabelledCloud -> one .ogpc file, checked against float64. ``query_graph``: the graph in it that labels
+points by text; ``lookup_grid`` and ``lookup_boxes``: the table by which that graph finds the nearest point's instance.
+``encoders``: text and image models -> the ONNX folders that encode words and masks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """CLIP and SigLIP models of transformers -> the encoder folders that the base install runs, through torch.onnx.export.
 
-Before a folder is written, its graph is opened by the same code that will open it later, and its vectors are held
-against torch's. What is exported is `masking.clip.load_model`'s: three model types, .safetensors, nothing fetched.
+Before a folder is written, its graph is opened by the same code that will open it later, and its vectors are compared
+with torch's. Models are loaded by `masking.clip.load_model`: three model types, .safetensors, nothing fetched.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ with naming_extra("torch, transformers and onnx", "export"):
 
     from og_pointcloud.masking.clip import TransformersModel, load_model, published_name
     from og_pointcloud.masking.pretrained import read_config
-if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
+if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, with a less helpful error
     raise MissingExtraError("onnxscript", "export")
 
 OPSET = 18
 TOLERANCE = 1e-5
-"""Largest difference from torch, in any entry of a unit vector, that is accepted; float32 reaches about 1e-6."""
+"""Largest accepted difference from torch in any entry of a unit vector; float32 reaches about 1e-6."""
 PARITY_TEXTS = (
     "", " ", "a", "chair", "a photo of a chair.", "red mug", "object", "things", "stuff", "texture",
     "fire extinguisher", "kitchen counter", "a wooden table with four legs, seen from above", "traffic light",
@@ -54,12 +54,12 @@ PARITY_TEXTS = (
     "A   lot\tof \n space", "&amp; &lt;b&gt;", "\x00\x1f control", "x" * 300,
     "a very long sentence that goes on " * 20, "<|endoftext|> early", "TV", "tv", "sofa", "window", "door", "lamp",
 )  # fmt: skip
-"""Labels and awkward texts, on which graph and torch are compared."""
+"""Labels and awkward texts on which graph and torch are compared."""
 PARITY_IMAGES = 4
 PARITY_PATCHES = (4, 7)
-"""Rows and columns of patches of a further image, whose shape is not the one of training."""
-MOST_PATCHES = 1 << 10
-"""Along a side of an image that a graph takes."""
+"""Rows and columns of patches of an additional image, whose shape differs from training."""
+MAX_PATCHES_PER_SIDE = 1 << 10
+"""Patches along a side of an image that a graph accepts."""
 
 
 def export_text_encoder(
@@ -69,15 +69,15 @@ def export_text_encoder(
     feature_space: str | None = None,
     templates: Sequence[str] = ("{}",),
 ) -> tuple[Path, dict[str, Any]]:
-    """Write a model's text half as a folder, complete or not at all. Returns the folder, and its manifest.
+    """Write a model's text encoder as a folder, atomically. Returns the folder and its manifest.
 
-    The folder also holds the vectors of our everyday words, which scenes judge labels by (`ask.choosing`).
+    The folder also holds the vectors of our everyday words, by which scenes judge labels (`ask.choosing`).
 
     source: a transformers folder of CLIP or SigLIP with its tokenizer. output: None for the user's cache, where it is
         found by its feature space.
-    feature_space: OWNER/MODEL, as scenes name it; None: what the model's configuration calls itself.
-    templates: texts with {} where a name goes; their vectors' mean stands for the name.
-    Raises OgPointcloudError; then nothing is written.
+    feature_space: OWNER/MODEL, as scenes name it; None: the name in the model's configuration.
+    templates: texts with {} for the name; the mean of their vectors represents the name.
+    Raises OgPointcloudError, and then writes nothing.
     """
     source = Path(source)
     templates = check_templates(templates)
@@ -100,23 +100,23 @@ def export_text_encoder(
 def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any]) -> dict[str, Any]:
     """Write a torch module as a text encoder if its graph gives the module's vectors. Returns the manifest.
 
-    tower: tokens (B, T) int64 -> (B, D) unit rows; T is any length up to the context, or the context alone where
-        about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries on the model.
+    tower: tokens (B, T) int64 -> (B, D) unit rows; T is any length up to the context, or exactly the context if
+        about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries about the model.
     """
     context, pad_id = about["context_length"], about["pad_id"]
-    # No size of the example is 1, which torch.export would take for a constant.
+    # No size of the example is 1, which torch.export would treat as a constant.
     example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
     batch, length = torch.export.Dim("batch"), torch.export.Dim("length", min=1, max=context)
     graph = _onnx_graph(tower, example, "tokens", ["text"], {0: batch, 1: length} if pad_id is None else {0: batch})
     with torch.no_grad():
         width = tower(example).shape[1]
     about = {**_heading(text_encoder.ENCODER), **about, "width": width, "precision": "fp32"}
-    held = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
-    encoder = TextEncoder(_with_manifest(about, held), str(folder))
+    contents = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
+    encoder = TextEncoder(_with_manifest(about, contents), str(folder))
     parity = _text_parity(tower, encoder)
     # The bank is encoded by the graph itself, as labels will be.
-    held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
-    files = _with_manifest({**about, "parity": parity}, held)
+    contents[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
+    files = _with_manifest({**about, "parity": parity}, contents)
     _write_folder(folder, files, text_encoder.ENCODER)
     return json.loads(files[MANIFEST])
 
@@ -128,14 +128,14 @@ def export_image_encoder(
     feature_space: str | None = None,
     crops: Sequence[Crop] = WITH_CONTEXT,
 ) -> tuple[Path, dict[str, Any]]:
-    """Write a model's image half as a folder, complete or not at all. Returns the folder, and its manifest.
+    """Write a model's image encoder as a folder, atomically. Returns the folder and its manifest.
 
-    source, output: as for ``export_text_encoder``. feature_space: OWNER/MODEL, the text encoder's; None: what the
-    model's configuration calls itself. crops: how masks are cut out unless the caller says otherwise.
-    Raises OgPointcloudError, and MissingExtraError where a package of the 'export' extra is absent.
+    source, output: as for ``export_text_encoder``. feature_space: OWNER/MODEL, the text encoder's; None: the name in
+    the model's configuration. crops: default way to crop masks.
+    Raises OgPointcloudError, and MissingExtraError if a package of the 'export' extra is absent.
     """
     model = TransformersModel(source, feature_space, crops=tuple(crops), attention="eager")
-    model.device = torch.device("cpu")  # the tower is exported there, and compared
+    model.device = torch.device("cpu")  # the tower is exported and compared there
     about = {"model_type": model.tower.model.config.model_type, "patch": model.patch}
     folder = Path(output) if output is not None else cache_folder() / f"{_folder_name(model.feature_space)}--image"
     return folder, write_image_encoder(folder, model, model.tower.cpu(), about)
@@ -144,14 +144,17 @@ def export_image_encoder(
 def write_image_encoder(folder: Path, model: ImageModel, tower: Any, about: dict[str, Any]) -> dict[str, Any]:
     """Write a torch module as an image encoder if its graph gives the model's vectors. Returns the manifest.
 
-    model: what the graph must agree with. tower: the same as a torch module with patches (`clip.ImageTower`), or the
-    bytes of a graph of (B, 3, S, S) -> (B, D) without. about: more entries of the manifest; "patch": of a module.
+    model: the reference that the graph must agree with. tower: the same model as a torch module with patches
+    (`clip.ImageTower`), or the bytes of a graph (B, 3, S, S) -> (B, D) without. about: further entries of the manifest;
+    "patch" is needed for a module.
     """
     if isinstance(tower, bytes):
         graph = tower
     else:
         patch = about["patch"]
-        sides = {axis: patch * torch.export.Dim(name, min=2, max=MOST_PATCHES) for axis, name in ((2, "h"), (3, "w"))}
+        sides = {
+            axis: patch * torch.export.Dim(name, min=2, max=MAX_PATCHES_PER_SIDE) for axis, name in ((2, "h"), (3, "w"))
+        }
         example = torch.zeros((2, 3, 3 * patch, 5 * patch))
         graph = _onnx_graph(tower, example, "pixels", ["image", "patches"], {0: torch.export.Dim("batch"), **sides})
     try:
@@ -185,26 +188,28 @@ class _TextTower(torch.nn.Module):
         return vectors / vectors.norm(dim=-1, keepdim=True)
 
 
-def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answers: list[str], dimensions: dict[int, Any]) -> bytes:
-    """The module as one file. OgPointcloudError where it would be larger than a graph in one file may be."""
-    held = sum(tensor.numel() * tensor.element_size() for tensor in {id(p): p for p in tower.parameters()}.values())
+def _onnx_graph(
+    tower: Any, example: torch.Tensor, input_name: str, output_names: list[str], dimensions: dict[int, Any]
+) -> bytes:
+    """The module as one serialized graph. OgPointcloudError if it exceeds the size limit of one file."""
+    weights = sum(tensor.numel() * tensor.element_size() for tensor in {id(p): p for p in tower.parameters()}.values())
     with _quietly(), torch.no_grad():
         program = torch.onnx.export(
             tower, (example,), dynamo=True, opset_version=OPSET, verbose=False,
-            input_names=[given], output_names=answers, dynamic_shapes=(dimensions,),
+            input_names=[input_name], output_names=output_names, dynamic_shapes=(dimensions,),
         )  # fmt: skip
     assert program is not None
     try:
         return program.model_proto.SerializeToString()
-    except Exception:  # protobuf's own kind
+    except Exception:  # protobuf's own type
         raise OgPointcloudError(
-            f"the model has {held / 1e9:.2f} GB of weights; expected less than 2 GB, all that one file may hold"
+            f"the model has {weights / 1e9:.2f} GB of weights; expected less than 2 GB, all that one file may hold"
         ) from None
 
 
 @contextmanager
 def _quietly() -> Any:
-    """torch.onnx.export tells of its own insides, as warnings and log lines."""
+    """Suppress the warnings and log lines of torch.onnx.export about its internals."""
     before = logging.root.manager.disable
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -219,7 +224,7 @@ def _quietly() -> Any:
 
 
 def _tokenizer_of(source: Path, is_causal: bool) -> dict[str, Any]:
-    """tokenizer.json beside the weights or, for CLIP, what transformers makes of vocab.json and merges.txt."""
+    """tokenizer.json beside the weights or, for CLIP, made by transformers from vocab.json and merges.txt."""
     if (source / text_encoder.TOKENIZER).is_file():
         description = read_json_object(source / text_encoder.TOKENIZER)
         return description if is_causal else _lower_casing(description)
@@ -235,7 +240,7 @@ def _tokenizer_of(source: Path, is_causal: bool) -> dict[str, Any]:
 
 
 def _lower_casing(description: dict[str, Any]) -> dict[str, Any]:
-    """SigLIP 2 was trained on lower case, which the Gemma tokenizer.json that its models carry does not say."""
+    """Add lower-casing for SigLIP 2, which was trained on lower case: its models' Gemma tokenizer.json lacks it."""
     model = description.get("model")
     if not isinstance(model, dict) or model.get("type") == "Unigram" or '"Lowercase"' in json.dumps(
         description.get("normalizer")
@@ -246,7 +251,7 @@ def _lower_casing(description: dict[str, Any]) -> dict[str, Any]:
 
 
 def _pad_id(source: Path, description: dict[str, Any]) -> int:
-    """Id of the token that texts are filled up to the context with; models that attend to it need that of training."""
+    """Id of the token that pads texts to the context; models that attend to it need the one used in training."""
     file, config = source / "tokenizer_config.json", read_config(source, "tokenizer_config.json")
     named = config.get("pad_token")
     token = named.get("content") if isinstance(named, dict) else named
@@ -272,7 +277,7 @@ def _pad_id(source: Path, description: dict[str, Any]) -> int:
 
 
 def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
-    """How far the graph is from torch; texts in torch stand alone, so that what a batch does to them shows."""
+    """Difference of the graph from torch; torch encodes texts one by one, so that effects of batching show."""
     tokens = [torch.tensor([encoder.tokens(text)]) for text in PARITY_TEXTS]
     with torch.no_grad():
         expected = torch.cat([tower(row) for row in tokens]).numpy()
@@ -283,10 +288,10 @@ def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
 
 
 def _image_parity(graph: bytes, model: ImageModel) -> dict[str, Any]:
-    """How far the graph is from the model, on images of noise and of even colors, and on patches if it has any."""
+    """Difference of the graph from the model, on images of noise and of uniform colors, and on patches if any."""
     size = model.preprocessing.size
     squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)
-    squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]  # the second half: even colors
+    squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]  # the second half: uniform colors
     pixels = model.preprocessing.pixels(squares)
     session = open_session(graph)
     got, expected = np.asarray(session.run(["image"], {"pixels": pixels})[0]), model(pixels)
@@ -301,7 +306,7 @@ def _image_parity(graph: bytes, model: ImageModel) -> dict[str, Any]:
 
 
 def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict[str, Any]:
-    """The manifest's figures; OgPointcloudError where a graph's unit rows are too far from torch's."""
+    """The manifest's parity figures; OgPointcloudError if the graph's unit rows differ too much from torch's."""
     error = float(np.abs(got - expected).max())
     if not error <= TOLERANCE:
         raise OgPointcloudError(
@@ -319,14 +324,14 @@ def _heading(encoder: EncoderFormat) -> dict[str, Any]:
     return {"format": encoder.name, "schema_version": encoder.version, "written_by": written_by()}
 
 
-def _with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
-    """The files of an encoder, the manifest among them, which says their sizes and checksums."""
+def _with_manifest(manifest: dict[str, Any], contents: dict[str, bytes]) -> dict[str, bytes]:
+    """The files of an encoder, including the manifest, which lists their sizes and checksums."""
     described = {
         name: {"bytes": len(data), "crc32": zlib.crc32(data), "sha256": hashlib.sha256(data).hexdigest()}
-        for name, data in held.items()
+        for name, data in contents.items()
     }
     text = json.dumps({**manifest, "files": described}, indent=1, ensure_ascii=False)
-    return {MANIFEST: text.encode(), **held}
+    return {MANIFEST: text.encode(), **contents}
 
 
 def _folder_name(feature_space: str) -> str:
@@ -334,7 +339,7 @@ def _folder_name(feature_space: str) -> str:
 
 
 def _write_folder(folder: Path, files: Mapping[str, bytes], encoder: EncoderFormat) -> None:
-    """Put a complete folder in place of an encoder, or of nothing; one that holds anything else stays."""
+    """Write a complete folder, replacing an encoder's if there is one; a folder with anything else in it is refused."""
     if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - encoder.files.keys()):
         raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
     with replacing_folder(folder, overwrite=True) as new:

@@ -1,16 +1,17 @@
-"""The kernel that builds the lookup grid: what is the nearest point's answer in each of a box's 4^3 children?
+"""The kernel that builds the lookup grid: finds the nearest point's answer in each of a box's 4^3 children.
 
-Every test is of a child, a cube, against points. Seen from its center, a point p is farther than a point q at all u of
-the cube if |u - p|^2 > |u - q|^2 everywhere. The difference is linear in u, so that its least value lies at a corner:
+Each test compares a child, a cube, with points in coordinates relative to its center. A point p is farther than a point
+q everywhere in the cube if |u - p|^2 > |u - q|^2 for all u in it. The difference is linear in u, so its minimum lies at
+a corner:
 
     |p|^2 - |q|^2 - 2 half |p - q|_1 > 0        (|.|_1: the sum of absolute coordinates)
 
-A point that loses to another in this way, or is out of reach of the cube, is nearest nowhere in it. If all points that
-are left have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
+A point that loses to another in this way, or is out of reach of the cube, is nearest nowhere in it. If all remaining
+points have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
 candidates among which a query in the child finds its nearest point; or the child is split into 4^3 children of its own.
 
-Cubes are inflated by ``rounding``, the most that float32 can move a query's cell, so that a query is always inside the
-child that it is looked up in.
+Cubes are inflated by ``rounding``, the most that float32 can move a query's cell, so that a query always lies inside
+the child in which it is looked up.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ import numpy as np
 from og_pointcloud.kernels import njit, prange
 
 EDGE = 4
-"""Children along the edge of a box that is split."""
+"""Children along the edge of a split box."""
 CHILDREN = EDGE**3
-SHORT_LIST = 8
-"""The graph compares so many candidates at once, so children share a list up to this length: it costs no time."""
-LONGEST_LIST = 64
-"""Most candidates of a child; one with more, as where points almost coincide, is left to the exact search."""
+MAX_SHARED_LIST_LENGTH = 8
+"""Children share lists up to this length; the graph always compares so many candidates, so sharing costs no time."""
+MAX_LIST_LENGTH = 64
+"""Largest number of a child's candidates; with more, where points almost coincide, it is left to the exact search."""
 TOO_FAR_CODE = 0
 """Answer code of a query with no cloud point within reach."""
-NOTHING, SPLIT = -1, CHILDREN
-"""In place of a list's number: the child has none, as its answer is certain or left open; or it is split further."""
-MANY_RIVALS = 4 * LONGEST_LIST
-"""With more candidates than this, a child is split without comparing each with each."""
+NO_CHILD, SPLIT = -1, CHILDREN
+"""In place of a list's index: the child has no list, as its answer is certain or left open; or it is split further."""
+MAX_COMPARED_CANDIDATES = 4 * MAX_LIST_LENGTH
+"""With more candidates than this, a child is split without comparing all pairs."""
 
-# Helpers are called by kernels alone: without wrappers of their own they compile sooner.
+# Helpers are called only by kernels: without wrappers of their own they compile faster.
 _helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignore[reportCallIssue]
 
 # numba takes no dataclasses; these tuples are the records of this file:
@@ -49,8 +50,8 @@ def answer_children(corners, level, limits, points, filled):  # noqa: ANN001, AN
     """Answer the children of each box; corners (m, 3): its low corner. Fills these four, in C order of the children:
 
     answers (m, 64): code of the answer, if certain; else that at the child's center, plus the number of codes.
-    child (m, 64): number of the list that settles the child, or NOTHING, or SPLIT.
-    lengths (m, 64), lists (m, 64, LONGEST_LIST): the box's lists, of points' numbers, ascending; length 0: no list.
+    child (m, 64): number of the list that settles the child, or NO_CHILD, or SPLIT.
+    lengths (m, 64), lists (m, 64, MAX_LIST_LENGTH): the box's lists, of points' numbers, ascending; length 0: no list.
     """
     for box in prange(len(corners)):
         _answer_box(box, corners[box], level, limits, points, filled)
@@ -72,13 +73,13 @@ def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, AN
         )
         code, certain, count = _answer_child(center, size / 2 + rounding, last, limits, near, squared, rows)
         answers[number] = code if certain else code + limits[2]
-        child[number] = NOTHING
+        child[number] = NO_CHILD
         if certain:
             continue
         # Queries come where points are: there the smaller children of a split answer most of them without a list.
         if not last and (holds[number] or count > longest):
             child[number] = SPLIT
-        elif count <= LONGEST_LIST:  # else left open
+        elif count <= MAX_LIST_LENGTH:  # else left open
             # Candidates that are not in the shared list yet are added; lists hold the cloud's numbers of points.
             chosen = _list_to_share(rows[:count], lists_of, lengths[:list_count])
             for row in rows[:count]:
@@ -163,7 +164,7 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
     within = _all_within_reach(nearest, half, reach)
     if within and _alike(near[3], rows[:count]):
         return code, True, count
-    if count > MANY_RIVALS and not last:
+    if count > MAX_COMPARED_CANDIDATES and not last:
         return code, False, count
     # Fewer candidates, each compared with each; they may then agree.
     count = _winners(center, half, near, squared, rows, count)
@@ -193,13 +194,13 @@ def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
 
 @_helper
 def _list_to_share(rows, lists_of, lengths):  # noqa: ANN001, ANN202
-    """Number of the list that grows least by these rows, and not beyond SHORT_LIST; else that of a new list."""
+    """Index of the list that grows least by these rows, up to MAX_SHARED_LIST_LENGTH; else of a new list."""
     chosen, least = len(lengths), len(rows)
     for number in range(len(lengths)):
         growth = len(rows)
         for row in rows:
             growth -= np.int64((lists_of[row] >> np.uint64(number)) & np.uint64(1))
-        if growth < least and (growth == 0 or lengths[number] + growth <= SHORT_LIST):
+        if growth < least and (growth == 0 or lengths[number] + growth <= MAX_SHARED_LIST_LENGTH):
             chosen, least = number, growth
     return chosen
 

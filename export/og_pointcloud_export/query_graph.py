@@ -20,21 +20,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.bundle.format import BEYOND_REACH, NEAR_SURFACE, ON_SURFACE
 from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import naming_extra
-from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, LONGEST_LIST, SHORT_LIST, TOO_FAR_CODE
+from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, MAX_LIST_LENGTH, MAX_SHARED_LIST_LENGTH, TOO_FAR_CODE
 from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid
 
 with naming_extra("onnx", "fit"):
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
-"""Candidates compared at once: the first number of every list, the next of lists that are longer, and so on."""
+LIST_LENGTHS = (MAX_SHARED_LIST_LENGTH, 20, MAX_LIST_LENGTH)
+"""Candidates compared at once: the first number for every list, the next one for longer lists, and so on."""
 OPSET, IR_VERSION = 18, 8
-"""The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
+"""The oldest versions with all that is needed (ScatterElements with max), so onnxruntime 1.17 and later run them."""
 
 
 def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
@@ -65,8 +65,8 @@ def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
 
 
 class _Graph:
-    """A graph in the making. A call adds a node and returns the name of its output, which other nodes take as input.
-    Inputs that are numpy arrays or scalars become constants."""
+    """Graph builder. A call adds a node and returns the name of its output, to be used as input of other nodes. Inputs
+    that are numpy arrays or scalars become constants."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -85,7 +85,7 @@ class _Graph:
         return name
 
     def _scalar(self, value: Any) -> str:
-        """A small constant, once for all nodes that take it."""
+        """A small constant, shared by all nodes that use it."""
         array = np.asarray(value)
         key = f"{array.dtype.str}{array.shape}", array.tobytes()
         if key not in self._scalars:
@@ -109,7 +109,7 @@ class _Graph:
         """Indices (m,) int32 where the comparison holds."""
         return self.int32(self.flat(self("NonZero", self(comparison, first, second))))
 
-    def rows_apart(self, table: str) -> list[str]:
+    def split_rows(self, table: str) -> list[str]:
         """(3, m) -> three times (m,)."""
         rows = [f"{table}_row_{axis}" for axis in "xyz"]
         self.nodes.append(helper.make_node("Split", [table], rows, name=f"{table}_rows", axis=0, num_outputs=3))
@@ -117,11 +117,11 @@ class _Graph:
 
     def sum_of_rows(self, table: str) -> str:
         """(3, m) -> (m,); twice as fast as ReduceSum."""
-        x, y, z = self.rows_apart(table)
+        x, y, z = self.split_rows(table)
         return self("Add", self("Add", x, y), z)
 
     def columns_at(self, table: str, columns: str) -> str:
-        """Those columns (m,) of a table of three rows, (3, m)."""
+        """(3, m), the columns with these indices (m,) of a table of three rows."""
         shape = self("Concat", np.array([3]), self("Shape", columns), axis=0)
         return self.at(table, self("Expand", columns, shape), axis=1)
 
@@ -130,11 +130,11 @@ FLAT, FIRST_AXIS, LAST_AXIS = np.array([-1]), np.array([0]), np.array([1])
 
 
 def _text_width(instances: InstanceTable) -> int:
-    return max(instances.descriptors.shape[1], 1)  # if nothing was ever described, any one column will do
+    return max(instances.descriptors.shape[1], 1)  # without any descriptor, one arbitrary column will do
 
 
 def _unit_rows(graph: _Graph, rows: str) -> str:
-    """Rows of unit length, in two steps so that neither tiny nor huge vectors leave float32."""
+    """Rows of unit length, in two steps so that tiny or huge vectors do not leave the range of float32."""
     smallest = np.finfo(np.float32).tiny
     scaled = graph("Div", rows, graph("Max", graph("ReduceMax", graph("Abs", rows), LAST_AXIS), smallest))
     return graph("Div", scaled, graph("Max", graph("ReduceL2", scaled, LAST_AXIS), smallest))
@@ -156,7 +156,7 @@ def _score_labels(graph: _Graph, instances: InstanceTable) -> tuple[str, str]:
     scores = graph("ScatterElements", empty, code_of_row, similarity, axis=0, reduction="max")
     past_the_end = np.array([np.iinfo(np.int64).max])
     graph("Slice", scores, np.array([CODE_OFFSET]), past_the_end, FIRST_AXIS, name="instance_scores")
-    # Column 0 stands for "unknown": it wins where no label has evidence, or there is no label at all.
+    # Column 0 means "unknown": it wins if no label has evidence, or there is no label at all.
     unknown = graph.constant("unknown_column", np.full((codes, 1), NO_EVIDENCE, np.float32))
     choices = graph("Concat", unknown, scores, axis=1)
     label = graph.int32(graph("Sub", graph("ArgMax", choices, axis=1, keepdims=0), np.int64(1)))
@@ -165,11 +165,11 @@ def _score_labels(graph: _Graph, instances: InstanceTable) -> tuple[str, str]:
 
 
 class _Lookup:
-    """points -> outputs: by the tables of ``LookupGrid``, and for the few points in boxes with a list by comparing
-    their distances to its candidates.
+    """points -> outputs: by the tables of ``LookupGrid`` and, for the few points in boxes with a list, by distances to
+    its candidates.
 
-    Coordinates are laid out as three rows of N: several times as fast as N rows of three, and sums of rows are exact in
-    integers wherever they run, which a matrix product with the strides is not.
+    Coordinates are three rows of N, several times as fast as N rows of three. Integer sums of rows are exact on every
+    runtime, which a matrix product with the strides is not.
     """
 
     def __init__(self, graph: _Graph, cloud: LabelledCloud, grid: LookupGrid) -> None:
@@ -179,16 +179,16 @@ class _Lookup:
             graph.constant(name, getattr(grid, name))
         graph.constant("node_values", grid.nodes.ravel())
         graph.constant("grid_low", grid.low[:, None])
-        # Candidates, numbered anew: of the cloud's points only those that are in a list.
+        # Candidates, renumbered: only the cloud's points that are in a list.
         point, candidate = np.unique(grid.candidates, return_inverse=True)
         xyz = cloud.xyz[point] if len(point) else np.zeros((1, 3), np.float32)
         answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
         for row, axis in enumerate("xyz"):
             graph.constant(f"candidate_{axis}", np.ascontiguousarray(xyz[:, row]))
         graph.constant("candidate_answer", answer.astype(np.min_scalar_type(int(answer.max()))))
-        # Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs. A
-        # search may read LONGEST_LIST entries from the start of the last list.
-        candidate = np.append(candidate, np.zeros(LONGEST_LIST, np.int64))
+        # Indices below 2^24, which are almost all, take three bytes instead of four: the high part has the smallest
+        # type that fits. A search may read MAX_LIST_LENGTH entries from the start of the last list, hence the padding.
+        candidate = np.append(candidate, np.zeros(MAX_LIST_LENGTH, np.int64))
         high = candidate >> 16
         graph.constant("candidates_low", (candidate & 0xFFFF).astype(np.uint16))
         graph.constant("candidates_high", high.astype(np.min_scalar_type(int(high.max()))))
@@ -197,7 +197,7 @@ class _Lookup:
         """Add all outputs but instance_scores."""
         graph, grid = self.graph, self.grid
         rows = graph("Transpose", "points", perm=[1, 0])
-        # The clamp is on integers: whatever NaN, infinity or 1e30 become there, they end in the outermost layer.
+        # Integers are clamped: whatever NaN, infinity or 1e30 are cast to, they end up in the outermost layer.
         last_cell = graph.constant("last_cell", (np.array(grid.shape) * EDGE - 1).astype(np.int32)[:, None])
         cell = graph("Min", graph("Max", graph.int32(self._position(rows)), np.int32(0)), last_cell)
         # Along each axis, cell -> what it adds to (block * 64 + brick in the block) * 64 + cell in the brick.
@@ -209,28 +209,28 @@ class _Lookup:
         brick_address = graph("Add", brick, graph.at(shifts, block))
         brick_values = graph.constant("brick_values", grid.bricks.ravel())
         brick_reference = graph.int32(graph.at(brick_values, brick_address))
-        # cell -> its value; the last row stands for bricks that have a list
+        # cell -> its value; bricks with a list read the last row
         row_shift = graph("Sub", graph("Min", brick_reference, self.last_row), brick)
         cell_address = graph("Add", place, graph("Mul", row_shift, np.int32(CHILDREN)))
         cell_value = graph.int32(graph.at("node_values", cell_address))
-        # The few points whose cell is split or has a list; for the others that value is the answer.
+        # The few points whose cell is split or has a list; for all others the value is the answer.
         pending = graph.where_true("GreaterOrEqual", cell_value, self.first_child_value)
         points = graph.columns_at(rows, pending)
         part_value, child = self._part(points, graph.at(brick_reference, pending), graph.at(cell_value, pending))
-        value = self._nearest_in_list(graph.rows_apart(points), part_value, child)
+        value = self._nearest_in_list(graph.split_rows(points), part_value, child)
         self._outputs(graph("ScatterElements", cell_value, pending, value, axis=0), code_label, code_score)
 
     def _position(self, rows: str) -> str:
-        """(3, m) points -> in cells, from the grid's low corner."""
+        """(3, m) points -> coordinates in cells, from the grid's low corner."""
         return self.graph("Mul", self.graph("Sub", rows, "grid_low"), np.float32(1) / self.grid.cell_size)
 
     def _outputs(self, value: str, code_label: str, code_score: str) -> None:
         """Value -> outputs: certain, or open with the answer at the center."""
         graph, codes, near_codes = self.graph, self.grid.codes, self.grid.codes // 2
-        # Small tables over all values below 2 codes: from codes on a value is open, and its code counts from there.
+        # Small tables over all values below 2 codes: a value >= codes is open, and its code is value - codes.
         code = np.arange(2 * codes) % codes
         code_answer = np.where(code > near_codes, code - near_codes, code)
-        distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
+        distance = np.where(code == TOO_FAR_CODE, BEYOND_REACH, np.where(code > near_codes, NEAR_SURFACE, ON_SURFACE))
         answer = graph.at(graph.constant("value_answer", code_answer.astype(np.int32)), value)
         instance = graph.constant("value_instance", (code_answer - CODE_OFFSET).astype(np.int32))
         graph("Less", value, np.int32(codes), name="certain")
@@ -240,15 +240,15 @@ class _Lookup:
         graph.at(code_score, answer, name="score")
 
     def _part(self, points: str, brick_reference: str, cell_value: str) -> tuple[str, str]:
-        """Value of the part of the cell that each of these points (3, m) lies in; and child, the number of what settles
-        that part, if anything does."""
+        """Value of the part of the cell in which each of these points (3, m) lies; and the index of the child that
+        answers that part, if it has one."""
         graph, zero = self.graph, np.int32(0)
         cell_child = self._child(brick_reference, cell_value)
-        # A reference, as a brick's: the cell's row if it is split, else beyond the last row for its list.
+        # A reference like a brick's: the cell's row if it is split, else beyond the last row for its list.
         is_split = graph("Less", graph.int32(graph.at("child_length", cell_child)), np.int32(1))
         list_reference = graph("Add", cell_child, self.last_row + np.int32(1))
         reference = graph("Where", is_split, graph.at("child_start", cell_child), list_reference)
-        # Where in the cell the point is, in parts.
+        # Position of the point within the cell, in parts.
         position = self._position(points)
         first_part = graph("Mul", graph.int32(position), np.int32(EDGE))
         part = graph(
@@ -257,22 +257,22 @@ class _Lookup:
         part_place = graph.sum_of_rows(graph("Mul", part, np.array([[EDGE**2], [EDGE], [1]], np.int32)))
         row_start = graph("Mul", graph("Min", reference, self.last_row), np.int32(CHILDREN))
         value = graph.int32(graph.at("node_values", graph("Add", row_start, part_place)))
-        # A child below 0, and unused, is that of a part that is answered.
+        # Parts that are already answered get a negative child, which is not used.
         return value, graph("Max", self._child(reference, value), zero)
 
     def _child(self, reference: str, value: str) -> str:
-        """A box's reference, and the value in it -> number of the child that settles it.
+        """A box's reference, and the value in it -> index of the child that answers it.
 
-        Of a row of nodes it is first_child + value - 2 codes. A reference to a list lies behind the last row by the
-        child's number + 1; that row has first_child -1 and the value 2 codes, so that one sum does for both.
+        For a row of nodes it is first_child + value - 2 codes. A reference to a list exceeds the last row by the
+        child's index + 1; that row has first_child -1 and the value 2 codes, so the same sum serves both.
         """
         graph = self.graph
         row = graph("Min", reference, self.last_row)
-        of_row = graph("Add", graph.at("first_child", row), graph("Sub", value, self.first_child_value))
-        return graph("Add", of_row, graph("Sub", reference, row))
+        row_child = graph("Add", graph.at("first_child", row), graph("Sub", value, self.first_child_value))
+        return graph("Add", row_child, graph("Sub", reference, row))
 
     def _nearest_in_list(self, points: list[str], part_value: str, child: str) -> str:
-        """The code of the nearest candidate of points (x, y, z) with a list; of the others their part's value.
+        """The code of the nearest candidate for points (x, y, z) with a list; for others their part's value.
 
         Arrays need one length for all lists: the first of LIST_LENGTHS; longer lists are read again up to the next.
         """
@@ -283,15 +283,15 @@ class _Lookup:
         value, longer_than = part_value, 0
         for entries in LIST_LENGTHS:
             rows = graph.where_true("Greater", length, np.int32(longer_than))
-            asked = [graph.at(coordinate, rows) for coordinate in points]
-            code = self._search(asked, graph.at(start, rows), entries)
+            queries = [graph.at(coordinate, rows) for coordinate in points]
+            code = self._search(queries, graph.at(start, rows), entries)
             value, longer_than = graph("ScatterElements", value, rows, code, axis=0), entries
         return value
 
     def _search(self, points: list[str], start: str, entries: int) -> str:
-        """The code of the nearest of some entries from the start of each point's list, decided in float64.
+        """The code of the nearest of the first ``entries`` of each point's list, decided in float64.
 
-        Of a shorter list the entries run on into the next list: points that are farther, or the same ones again.
+        For a shorter list they continue into the next list: those points are farther, or the same ones again.
         """
         graph, cloud = self.graph, self.cloud
         steps = np.arange(entries, dtype=np.int32)[None]
@@ -300,12 +300,12 @@ class _Lookup:
         low, high = (graph.int32(graph.at(f"candidates_{part}", address)) for part in ("low", "high"))
         candidate = graph("Add", low, graph("Mul", high, np.int32(1 << 16)))
         squares = []
-        for axis, asked in zip("xyz", points, strict=True):
+        for axis, query in zip("xyz", points, strict=True):
             coordinate = graph("Reshape", graph.double(graph.at(f"candidate_{axis}", candidate)), shape)
-            difference = graph("Sub", coordinate, graph("Unsqueeze", graph.double(asked), LAST_AXIS))
+            difference = graph("Sub", coordinate, graph("Unsqueeze", graph.double(query), LAST_AXIS))
             squares.append(graph("Mul", difference, difference))
         squared = graph("Add", graph("Add", squares[0], squares[1]), squares[2])
-        # Lists ascend by point number, so the first of equals is the lowest.
+        # Lists ascend by point index, so the first of equals has the lowest.
         nearest = graph("ArgMin", squared, axis=1)
         distance = graph.flat(graph.at(squared, nearest, axis=1))
         nearest = graph.flat(graph.at(graph("Reshape", candidate, shape), nearest, axis=1))

@@ -1,4 +1,4 @@
-"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle.format says what is in it."""
+"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle.format describes it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from og_pointcloud_export.lookup_grid import build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
 SCORE_TOLERANCE = 1e-5
-"""Largest cosine error of the graph against float64 that is accepted; float32 sums of 512 terms reach 1e-6."""
+"""Largest accepted cosine error of the graph against float64; float32 sums of 512 terms reach 1e-6."""
 PARITY_TEXTS, PARITY_POINTS = 64, 4096
 
 
@@ -44,12 +44,12 @@ class QueryModel:
 
 
 def write_bundle(cloud: SceneLike, path: StrPath, *, text_encoder: StrPath | None = None) -> Path:
-    """Write a cloud, or a scene, as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
+    """Write a cloud or a scene as .ogpc, atomically, with the same bytes for the same cloud. Returns the path.
 
     text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,
-    or of the one that is found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if there is any.
-    Raises OgPointcloudError where the provenance is no JSON, or longer than readers take, as a word may be, where the
-    graph disagrees with numpy, or the encoder is of another feature space: then nothing is written.
+    or of the one found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if any.
+    Raises OgPointcloudError, and writes nothing, if the provenance is no JSON, if it or a word is longer than readers
+    accept, if the graph disagrees with numpy, or if the encoder is of another feature space.
 
     >>> import pathlib, tempfile
     >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
@@ -72,7 +72,7 @@ def write_bundle(cloud: SceneLike, path: StrPath, *, text_encoder: StrPath | Non
     manifest = _manifest(cloud, model, members)
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {"manifest.json": manifest, **members}.items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # by ZipInfo, dated 1980: equal contents, equal bytes
+            archive.writestr(zipfile.ZipInfo(name), data)  # ZipInfo is dated 1980: equal contents, equal bytes
     return path
 
 
@@ -90,11 +90,11 @@ def query_model(cloud: LabelledCloud) -> QueryModel:
 
 
 def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
-    """Members below arrays/, by name. The descriptors are stored in query.onnx alone, where the manifest says."""
+    """Members below arrays/, by name. Descriptors are stored only in query.onnx, at an offset in the manifest."""
     columns = [field.name for field in fields(InstanceTable) if field.name != "descriptors"]
     table = {INSTANCE_MEMBERS.get(name, name): getattr(cloud.instances, name) for name in columns}
     if not np.isfinite(table["reliability"]).any():
-        del table["reliability"]  # as in files of before there was one
+        del table["reliability"]  # like files older than this column
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
     if cloud.rgb is not None:
         arrays["rgb"] = cloud.rgb
@@ -111,7 +111,7 @@ def _smallest_signed(ids: NDArray[np.int32]) -> NDArray[np.signedinteger]:
 
 
 def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
-    """Run the graph on the cloud's words and random vectors, and on its points, moved by 0, 0.5 or 2 spacings."""
+    """Compare the graph with numpy on the cloud's words, random vectors, and points moved by 0, 0.5 or 2 spacings."""
     session = open_session(onnx)
     random = np.random.default_rng(0)
     width = session.get_inputs()[1].shape[1]
@@ -124,7 +124,7 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
 
     names = ["instance_scores", "instance", "certain"]
     scores, instance, certain = (np.asarray(out) for out in session.run(names, {"points": points, "text": text}))
-    # What the graph is certain of must be what the exact search says; what it leaves open is counted.
+    # Certain answers of the graph must equal those of the exact search; open ones are counted.
     nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(points)
     exact = np.full(len(points), TOO_FAR, np.int32)
     exact[nearest != NONE_WITHIN_REACH] = cloud.instance_ids[nearest[nearest != NONE_WITHIN_REACH]]

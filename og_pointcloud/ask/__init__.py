@@ -1,1 +1,1 @@
-"""Words in, labelled points out: what answers from a labelled cloud. numpy and onnxruntime, nothing else."""
+"""Queries to a labelled cloud: words in, labelled points out. Needs numpy and onnxruntime alone."""

@@ -1,16 +1,16 @@
-"""Which label fits an instance, how surely, and whether any does: text vectors and descriptors -> Choice.
+"""Which label fits an instance, with what probability, and whether any does: text vectors and descriptors -> Choice.
 
-A cosine of an image with a text says little by itself. On real CLIP a fitting text has about 0.33 and any other 0.18,
-texts have 0.74 among themselves and images 0.53: all images share one large direction, all texts another, and some
-words are close to every image. So a score is read against what it would be by chance, in three steps:
+The cosine of an image with a text says little by itself. With real CLIP a fitting text has about 0.33 and any other
+0.18, while texts have 0.74 among themselves and images 0.53: all images share one large component, all texts another,
+and some words are close to every image. So a score is compared with what it would be by chance, in three steps:
 
-1. Center. What all kinds of things in the scene share is taken off descriptors, what all words share off the words.
-2. Standardise. A bank of a few hundred everyday words (``WordBank``) shows how the words that do not fit score on this
+1. Center. Subtract what all kinds of things in the scene share from descriptors, what all words share from words.
+2. Standardise. A bank of a few hundred everyday words (``WordBank``) shows how words that do not fit score on this
    instance; a label's evidence is its distance from their mean, in their standard deviations.
-3. Weigh. An instance is one of the labels, or what another word of the bank says, or nothing that a word stands out
-   for. Their posterior probabilities add up to one; the last two are "unknown".
+3. Weigh. An instance is one of the labels, or what another word of the bank names, or something that no word stands
+   out for. Their posterior probabilities add up to one; the last two are "unknown".
 
-No threshold is in cosines, none is tuned to a scene: the null distribution is the instance's own.
+No threshold is a cosine, and none is tuned to a scene: each instance has its own null distribution.
 
 Without a word bank the largest cosine wins.
 """
@@ -41,8 +41,8 @@ from og_pointcloud.cloud import (
 from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 from og_pointcloud.settings import ChoosingSettings
 
-SAME = 1e-5
-"""Unit vectors no farther apart than this are of the same text: float32 rounds them by a hundredth of it."""
+SAME_TEXT_DISTANCE = 1e-5
+"""Unit vectors at most this far apart are the same text; float32 rounding is a hundredth of it."""
 
 
 class Reason(IntEnum):
@@ -63,12 +63,12 @@ class Reason(IntEnum):
     UNOBSERVED = 4
     """No view saw it."""
     TOO_FAR = 5
-    """No point of the map within reach."""
+    """No point of the scene is within reach."""
     NOT_FINITE = 6
     """Its coordinates hold NaN or infinity."""
 
     def __str__(self) -> str:
-        """The reason as part of a sentence on points: "12 are ..."."""
+        """The reason as the end of a sentence about points: "12 are ..."."""
         return _IN_WORDS[self]
 
 
@@ -87,16 +87,16 @@ _IN_WORDS = {
 class Choice:
     """The answer for K instances and L labels.
 
-    labels: (K,) int32, the most probable label, -1 where "none of these" is more probable than all together.
-    probability: (K,) float32, of that label; 0 where unknown.
+    labels: (K,) int32, the most probable label, -1 where "none of these" is more probable than all labels together.
+    probability: (K,) float32, probability of that label; 0 where unknown.
     unknown: (K,) float32, probability that none of the labels fits; 1 for an instance without descriptor.
     table: (K, L) float32, probability of each label: rows of different labels add up to 1 - unknown. Labels with the
-        same vector are one hypothesis and have its probability each.
+        same vector are one hypothesis, and each has its probability.
     evidence: (K, L) float32, standard deviations above the bank's words; -inf without descriptor or text.
     reasons: (K,) int8, a ``Reason``.
-    membership: (K,) float32, probability that a point with the instance's id is of it: of v views that agreed on the
-        instance all said so, which makes (v + 1/2) / (v + 1) (Jeffreys' prior).
-    calibrated: false where there was no bank: probability and unknown are then NaN, evidence is the cosine.
+    membership: (K,) float32, probability that a point with the instance's id belongs to it: all v views of the instance
+        agreed, which gives (v + 1/2) / (v + 1) (Jeffreys' prior).
+    calibrated: false without a bank: probability and unknown are then NaN, and evidence is the cosine.
     """
 
     labels: IntArray
@@ -110,32 +110,32 @@ class Choice:
 
     @property
     def scores(self) -> FloatArray:
-        """(K, L) what words are ranked by: the probability where calibrated, else the cosine (-inf: no descriptor)."""
+        """(K, L) scores that rank words: the probability if calibrated, else the cosine (-inf: no descriptor)."""
         return self.table if self.calibrated else self.evidence
 
     def ranking(self, label: int) -> NDArray[np.intp]:
-        """(K,) instances by how well one label fits them, best first, of equals the first.
+        """(K,) instances by how well one label fits them, best first; ties go to the smaller id.
 
-        Probabilities that have run up against 0 or 1 are told apart by their evidence.
+        Evidence ranks instances whose probabilities are saturated at 0 or 1.
         """
         return np.lexsort((-self.evidence[:, label], -self.scores[:, label]))
 
     def words(self, instance: int, names: Sequence[str], count: int | None = None) -> list[tuple[str, float]]:
-        """The labels of one instance with their scores, best first, or the first ``count`` of them.
+        """The labels of one instance with their scores, best first; only the first ``count`` if given.
 
-        names: (L,) of the labels. Empty for an instance without a descriptor.
+        names: (L,) names of the labels. Empty for an instance without a descriptor.
         """
         if self.reasons[instance] == Reason.NOT_DESCRIBED:
             return []
-        # Of one instance, more evidence is a higher score, also where probabilities have run up against 0.
+        # Within one instance, more evidence means a higher score, also where probabilities are saturated at 0.
         order: list[int] = np.argsort(-self.evidence[instance], kind="stable")[:count].tolist()
         return [(names[index], float(self.scores[instance, index])) for index in order]
 
     @cached_property
     def by_id(self) -> tuple[IntArray, FloatArray, NDArray[np.int8]]:
-        """Label, score and reason by instance id, (K + 3,) each: after the last instance those of ids -3, -2 and -1.
+        """Label, score and reason by instance id, (K + 3,) each: those of ids -3, -2 and -1 follow the last instance.
 
-        The score is that of a point with the id. Where calibrated: its instance's probability times the membership, as
+        The score is that of a point with the id: if calibrated, its instance's probability times the membership, as
         both must be right; else the cosine. 0 where unknown.
         """
         beyond = {TOO_FAR: Reason.TOO_FAR, UNOBSERVED: Reason.UNOBSERVED, BACKGROUND: Reason.IN_NO_MASK}
@@ -150,17 +150,17 @@ class Choice:
         )
 
     def at(self, instances: NDArray[np.integer]) -> tuple[IntArray, FloatArray, NDArray[np.int8]]:
-        """Label, score and reason of points, (N,) each, as `by_id` has them, by their instance ids."""
+        """Label, score and reason of points, (N,) each, looked up in `by_id` by their instance ids."""
         labels, scores, reasons = self.by_id
         return labels[instances], scores[instances], reasons[instances]  # negative ids index from the end
 
 
 @dataclass(frozen=True)
 class Standard:
-    """Numbers that turn the cosines of a scene's R descriptors into evidence, for asking many scenes at once.
+    """Numbers that turn the cosines of a scene's R descriptors into evidence, for querying many scenes at once.
 
-    An instance's evidence is the largest, over its descriptors, of ``scale * ((descriptor - common) @ direction) +
-    shift``, where ``direction`` is the text's unit vector without the bank's mean, of length one again.
+    An instance's evidence is the maximum over its descriptors of ``scale * ((descriptor - common) @ direction) +
+    shift``, where ``direction`` is the text's unit vector minus the bank's mean, normalized again.
     common: (D,) float32. scale, shift: (R,) float32. sharpness: as `Chooser.sharpness`.
     """
 
@@ -171,7 +171,7 @@ class Standard:
 
 
 class Chooser:
-    """The instances of one scene, prepared for any number of labels. Cheap to keep, safe to share by threads."""
+    """The instances of one scene, prepared for any number of labels. Cheap to keep, thread-safe."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class Chooser:
         settings: ChoosingSettings | None = None,
         feature_space: str = UNKNOWN_SPACE,
     ) -> None:
-        """feature_space: of the descriptors. FeatureSpaceError where bank and descriptors differ in width."""
+        """feature_space: of the descriptors. FeatureSpaceError if bank and descriptors differ in width."""
         self.settings = settings or ChoosingSettings()
         self.bank = bank
         self._count = len(instances)
@@ -192,18 +192,18 @@ class Chooser:
         if bank is None or len(self._descriptors) == 0:
             return
         self._require_width(bank.vectors, "word bank's vectors")
-        # Step 1, center: words without what all words share, descriptors without what all kinds of things share.
+        # Step 1, center: subtract the words' mean from words, and what all kinds of things share from descriptors.
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
         self._common = common_part(self._descriptors, self._bank_directions, self.settings.sharpness)
         self._centered = self._descriptors - self._common
-        # Step 2, standardise: how the bank's words score on each descriptor is its null distribution.
+        # Step 2, standardise: the scores of the bank's words on a descriptor are its null distribution.
         scores = self._centered @ self._bank_directions.T
         self._middle, self._spread = _moments(scores)
         # The best of several descriptors scores higher by chance alone, so instances are standardised once more.
         best = self._best_descriptor((scores - self._middle) / self._spread)
         self._best_middle, self._best_spread = _moments(best)
         self._bank_evidence = (best - self._best_middle) / self._best_spread
-        # How far a fitting word stands out in this scene: as far as the bank's best one on a quarter of the instances.
+        # How far a fitting word stands out in this scene: the upper quartile, over instances, of the bank's best word.
         self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
 
     def standard(self) -> Standard:
@@ -218,7 +218,7 @@ class Chooser:
     def choose(self, texts: ArrayLike) -> Choice:
         """The label of each instance.
 
-        texts: (L, D) one text vector a label, of any length, float16 to float64; a zero row fits nothing.
+        texts: (L, D) one text vector per label, of any length, float16 to float64; a zero row fits nothing.
         FeatureSpaceError for NaN or infinity, or another width than the descriptors'.
         """
         texts = finite_rows(texts, "label vectors")
@@ -231,15 +231,15 @@ class Chooser:
             return self._answer(cosines, nothing, nothing[:, 0])
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
         scores = (self._centered @ directions.T - self._middle) / self._spread
-        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # as the bank's words were
-        evidence[:, ~texts.any(axis=1)] = -np.inf  # a zero row: less the bank's mean it would point somewhere
+        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # like the bank's words
+        evidence[:, ~texts.any(axis=1)] = -np.inf  # a zero row, minus the bank's mean, would point somewhere
         return self._answer(evidence, *self._posterior(evidence, texts, directions))
 
     def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
         self._space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), what)
 
     def _best_descriptor(self, scores: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(described, ...) each instance's best score, from the scores of all descriptors (R, ...)."""
+        """(described, ...) best score of each described instance, from the scores of all descriptors (R, ...)."""
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
@@ -248,19 +248,19 @@ class Chooser:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
         Likelihoods are those of a linear discriminant: a fitting word's evidence is normal about ``sharpness`` with
-        deviation 1, any other's about 0, so their ratio is exp(sharpness * evidence - sharpness^2 / 2). How far
-        fitting words stand out is seen in the scene: the best words of the bank, at the upper quartile of instances.
+        deviation 1, any other's about 0, so their ratio is exp(sharpness * evidence - sharpness^2 / 2). ``sharpness``,
+        how far fitting words stand out, is measured in the scene (`__init__`).
         """
         sharpness = self.sharpness
-        # Logarithms of likelihood times prior, with exp(-sharpness^2 / 2) and the prior of one kind left out of all.
-        # Labels of the same vector are one hypothesis: two spellings of a word do not double its prior.
+        # Logarithms of likelihood times prior; the common factors exp(-sharpness^2 / 2) and prior of one kind cancel.
+        # Labels with the same vector are one hypothesis: two spellings of a word do not double its prior.
         hypothesis, first = _distinct(texts)
         log_words = np.log(max(len(first), self.settings.kinds))
         log_label = sharpness * evidence[:, first].astype(np.float64)
         # "None" has the prior of all kinds together, and the mean likelihood of the bank's words other than the labels.
         other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
         log_none = log_words + log_mean_likelihood(sharpness * self._bank_evidence[:, other].astype(float), sharpness)
-        # The largest exponent is taken off before exp, which would overflow beyond 709.
+        # The largest exponent is subtracted before exp, which would overflow beyond 709.
         top = np.maximum(log_none, log_label.max(axis=1))
         weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
         total = weight.sum(axis=1) + none
@@ -269,10 +269,10 @@ class Chooser:
     def _answer(
         self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
     ) -> Choice:
-        """The choice for all K instances, from arrays (described, ...) of those with a descriptor."""
+        """The choice for all K instances, from arrays (described, ...) of the instances with a descriptor."""
         answer = self._nothing(evidence.shape[1])
         best = (evidence if self.bank is None else table).argmax(axis=1)
-        # Not "unknown <= 0.5": without a bank it is NaN, and the best label is answered.
+        # Not "unknown <= 0.5": without a bank it is NaN, and the best label is the answer.
         fits = ~(unknown > 0.5) & (evidence[np.arange(len(best)), best] > -np.inf)
         rows = self._described
         answer.labels[rows] = np.where(fits, best, UNKNOWN)
@@ -299,8 +299,8 @@ class Chooser:
 
 
 def log_mean_likelihood(exponents: DoubleArray, sharpness: ArrayLike) -> DoubleArray:
-    """(n,) log of the mean likelihood that words give, at least that of a word that fits by chance. exponents: (n, W)
-    sharpness times evidence. sharpness: (n,), or one for all."""
+    """(n,) log of the words' mean likelihood, at least that of a word that fits by chance. exponents: (n, W) sharpness
+    times evidence. sharpness: (n,), or one for all."""
     # The mean of exp(sharpness * e) over standard normal evidence e is exp(sharpness^2 / 2).
     by_chance = np.broadcast_to(np.square(sharpness) / 2, len(exponents))
     if exponents.shape[1] == 0:
@@ -309,31 +309,31 @@ def log_mean_likelihood(exponents: DoubleArray, sharpness: ArrayLike) -> DoubleA
 
 
 def common_part(descriptors: FloatArray, bank_directions: FloatArray, sharpness: float) -> FloatArray:
-    """(D,) what is taken off each descriptor: the mean over kinds of things, times 1 - 1 / (number of kinds).
+    """(D,) the vector to subtract from each descriptor: the mean over kinds of things, times 1 - 1 / (number of kinds).
 
-    Each kind counts once, so that an object in pieces, or a hall of chairs, does not turn what makes a chair into what
-    all things share. Descriptors are of one kind when the same word of the bank fits them best. Where no word stands
-    out by at least half of what fitting words do, the kind is not known and the descriptor does not count. One kind
-    alone does not say what is shared: nothing is taken off; of two kinds, half of their mean.
+    Each kind counts once, so that an object in pieces, or a hall full of chairs, does not make the features of a chair
+    look common to all things. Descriptors are of one kind if the same word of the bank fits them best. A descriptor is
+    ignored if no word stands out by at least half of what fitting words do: its kind is not known. One kind alone does
+    not tell what is shared: nothing is subtracted; for two kinds, half of their mean.
     """
     common, word_number = np.zeros(descriptors.shape[1], np.float32), _distinct(bank_directions)[0]
-    # Kinds are found on the descriptors as they are, then once more without what those kinds share; more rounds
-    # change next to nothing.
+    # Kinds are found on the raw descriptors, then once more without what those kinds share; further rounds change
+    # almost nothing.
     for _ in range(2):
         scores = (descriptors - common) @ bank_directions.T
         middle, spread = _moments(scores)
         kind = word_number[scores.argmax(axis=1)]
         evidence = ((scores - middle) / spread).max(axis=1)
         fits = evidence >= max(sharpness, np.quantile(evidence, 0.75)) / 2
-        weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]  # adds up to one over each kind
+        weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]  # adds up to one within each kind
         kinds = max(weight.sum(), 1)
         common = ((1 - 1 / kinds) * (weight / kinds) @ descriptors).astype(np.float32)
     return common
 
 
 def _distinct(texts: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """(T,) number of each text among the different ones, and (different,) where each comes first."""
-    # Five digits: the same text is the same vector again, whatever length it was given at.
+    """(T,) index of each text among the distinct ones, and (distinct,) row of the first occurrence of each."""
+    # Five digits: the same text gives the same unit vector, whatever the length of the vector given.
     rows = unit_rows(texts)
     rounded = np.round(rows, 5) + 0.0  # -0 becomes 0
     _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
@@ -345,25 +345,25 @@ def _distinct(texts: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _joined(rows: NDArray[np.floating]) -> NDArray[np.intp]:
-    """(n,) for each of some unit rows (n, D) the number of one that is the same within SAME, its own where none is.
+    """(n,) for each unit row (n, D), the index of a row within SAME_TEXT_DISTANCE of it; its own if there is none.
 
-    Rounding alone tells the same vector apart where a number lies halfway between two that it rounds to.
+    Rounding alone separates equal vectors where a component lies halfway between two rounded values.
     """
     along = rows @ unit_rows(np.random.default_rng(0).normal(size=rows.shape[1])).astype(rows.dtype)
     order, same = np.argsort(along), np.arange(len(rows))
-    # Rows that are the same lie as near along any direction; most have no other so near.
+    # Equal rows are also close along any one direction, where most rows have no close neighbor.
     for step in range(1, len(rows)):
         one, other = order[:-step], order[step:]
-        near = np.flatnonzero(along[other] - along[one] <= SAME)
-        if not len(near):
+        pairs = np.flatnonzero(along[other] - along[one] <= SAME_TEXT_DISTANCE)
+        if not len(pairs):
             break
-        apart = np.linalg.norm(rows[one[near]] - rows[other[near]], axis=1)
-        for pair in near[apart <= SAME]:
+        distance = np.linalg.norm(rows[one[pairs]] - rows[other[pairs]], axis=1)
+        for pair in pairs[distance <= SAME_TEXT_DISTANCE]:
             same[same == same[other[pair]]] = same[one[pair]]
     return same
 
 
 def _moments(scores: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and standard deviation of each row, as columns; a row without spread gets no evidence at all."""
-    spread = scores.std(axis=1, keepdims=True)  # 1e-7 is float32's rounding of a cosine: no spread at all
+    """Mean and standard deviation of each row, as columns; infinity for a row without spread, so its evidence is 0."""
+    spread = scores.std(axis=1, keepdims=True)  # 1e-7 is the rounding of a float32 cosine: no spread
     return scores.mean(axis=1, keepdims=True), np.where(spread > 1e-7, spread, np.float32(np.inf))

@@ -1,7 +1,7 @@
 """Point clouds of other libraries -> an array of points, without importing any of them.
 
-A cloud is recognized by the module of its type: whoever holds such an object has imported its library already. No row
-is dropped, not even one with NaN: row i of the answer belongs to row i of the cloud.
+A cloud is recognized by the module of its type: whoever holds such an object has already imported its library. No row
+is dropped, not even one with NaN: row i of the result is row i of the cloud.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from og_pointcloud.scene import Points, dense_tensor
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
 NAMES_FIELD = "og_names"
-"""Where hosts and files that can keep texts hold the names that ``og_label`` counts."""
+"""Field of hosts and files that can store text: the names that ``og_label`` indexes."""
 
 
 def world_points(pcd: Any) -> NDArray[np.float64]:
     """(N, 3) float64 world coordinates of a cloud; rows may be NaN.
 
-    pcd: an array of shape (N, 3); a torch tensor of that shape, wherever it lies; the Points of `read_points`; an
+    pcd: an array of shape (N, 3); a torch tensor of that shape, on any device; the Points of `read_points`; an
     Open3D point cloud or mesh, legacy or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a
     PointCloud2 message; or the path of a geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices.
     SceneError for anything else; MissingExtraError where reading needs a library that is not installed.
@@ -53,12 +53,12 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
 
 
 _NAMED: dict[str, Path] = {}
-"""Files that datasets of this process came from, by what the datasets call them."""
+"""The .ogpc files that this process's datasets came from, by `scene_name`."""
 
 
 def scene_name(path: StrPath) -> str:
-    """How a dataset names the .ogpc file that its labels came from: by the file's name, and digits that tell it from
-    others of that name. Not by its path, since datasets are saved and passed on."""
+    """How a dataset names the .ogpc file that its labels came from: the file's name, and a hash that distinguishes it
+    from others of that name. Not its path, since datasets are saved and passed on."""
     path = Path(path).resolve()
     name = f"{path.name}#{blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
     _NAMED[name] = path
@@ -66,10 +66,10 @@ def scene_name(path: StrPath) -> str:
 
 
 def carried_scene(pcd: Any) -> Path | None:
-    """The .ogpc file that a cloud says its labels came from, if it does: the one that this process named so, else a
-    file of that name in the working folder. A dataset may be a stranger's, so it can name no other place.
+    """The .ogpc file that a cloud says its labels came from, None if it says none: the file that this process named so,
+    else a file of that name in the working folder. A dataset may be untrusted, so it can name no other place.
 
-    OgPointcloudError where there is no such file.
+    OgPointcloudError if there is no such file.
     """
     if _host(pcd) != "pyvista" or SCENE_FIELD not in pcd.field_data:
         return None
@@ -89,7 +89,7 @@ def carried_scene(pcd: Any) -> Path | None:
 
 
 def import_plugin(module: str, extra: str) -> Any:
-    """A plugin of ours, og_pointcloud_*; MissingExtraError names the extra where its host library is not installed."""
+    """One of our plugins, og_pointcloud_*; MissingExtraError names the extra if its host library is not installed."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -97,8 +97,8 @@ def import_plugin(module: str, extra: str) -> Any:
 
 
 def _host(pcd: Any) -> str | None:
-    """Library of a cloud's type or of one it is derived from; None for arrays, of whatever kind."""
-    if isinstance(pcd, np.ndarray):  # PyVista and trimesh have kinds of their own: mesh.points, mesh.vertices
+    """Library of a cloud's type or of a base class; None for arrays of any kind."""
+    if isinstance(pcd, np.ndarray):  # PyVista and trimesh subclass it: mesh.points, mesh.vertices
         return None
     for kind in type(pcd).__mro__:
         root = kind.__module__.partition(".")[0]
@@ -125,12 +125,12 @@ _READERS = {
     "laspy": lambda las: getattr(las, "xyz", None),
     "torch": dense_tensor,
 }
-"""Root module of a cloud's type -> what finds its points, None where it has none."""
+"""Root module of a cloud's type -> function that returns its points, or None if it has none."""
 
 
 def _checked(values: Any, kind: str) -> NDArray[np.float64]:
     if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiu":
-        values = np.ma.filled(values.astype(np.float64), np.nan)  # what is masked has no place
+        values = np.ma.filled(values.astype(np.float64), np.nan)  # masked points have no coordinates
     try:
         points = np.asarray(values)
     except ValueError as error:

@@ -1,7 +1,7 @@
-"""The instances of a scene as a table: where each is, how large, what shows it, and which words fit it best.
+"""The instances of a scene as a table: position, size, evidence and best words of each.
 
-Places and boxes are of an instance's main part, without its strays (`boxes.main_part`). Each row works its own out when
-it is first asked, so that a table costs nothing until then.
+Centroids and boxes are those of an instance's main part, without strays (`boxes.main_part`). Each row computes them on
+first access, so a table costs nothing until then.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.tables import csv_text
 
 LABELLED = "labelled"
-"""State of an instance that words can be compared with."""
+"""State of an instance that can be compared with words."""
 NO_FEATURE = "no feature"
-"""State of an instance that no mask gave a feature: it answers every word with unknown."""
+"""State of an instance that no mask gave a feature: every word is answered with unknown."""
 EMPTY = "empty"
 """State of an instance without points."""
 
-WORDS = 3
-"""Words that a row names."""
-SHOWN = 12
-"""Rows that a printed table shows before it says how many more there are."""
+WORDS_PER_ROW = 3
+"""Best words listed in a row."""
+MAX_ROWS_SHOWN = 12
+"""Rows of a printed table; the rest are only counted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """What is known of one instance. Lengths and places in the scene's world frame and unit, float64.
+    """What is known about one instance. Coordinates and lengths in the scene's world frame and unit, float64.
 
-    id: in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
-    views, masks: how many saw it and how many are joined in it. agreement: mean cosine of its masks' features with
-    their descriptor, -1 to 1. reliability: how far half of the views give its points again and its masks name it, 0 to
-    1, None where that is not known. visible_area: pixels that its masks put on it, over all views. part_of: the
-    instance that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
+    id: row in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
+    views, masks: number of views that saw it, and of masks joined in it. agreement: mean cosine of its masks' features
+    with their descriptor, -1 to 1. reliability: how well half of the views reproduce its points and its masks its name,
+    0 to 1, None if not known. visible_area: pixels that its masks put on it, over all views. part_of: the instance that
+    it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
     state: "labelled", "no feature" or "empty". words: (word, score), best first; a score is the probability that the
-    instance is what the word says, where the scene has a word bank, else a cosine.
+    instance is what the word says if the scene has a word bank, else a cosine.
 
     >>> chair = og.instance_table(cloud)[0]  # of `LabelledCloud`'s example
     >>> chair.point_indices, chair.state, chair.words[0]
@@ -72,12 +72,12 @@ class Instance:
 
     @property
     def points(self) -> int:
-        """How many points of the scene belong to it."""
+        """Number of its points."""
         return len(self.point_indices)
 
     @property
     def xyz(self) -> NDArray[np.float64]:
-        """(n, 3) float64, its points in world coordinates, strays among them."""
+        """(n, 3) float64, its points in world coordinates, including strays."""
         return self._cloud.xyz[self.point_indices].astype(np.float64) + self._cloud.origin
 
     @cached_property
@@ -90,7 +90,7 @@ class Instance:
         """(3,) mean of its main part; None without points."""
         if not self.points:
             return None
-        # Relative to one of its points: sums of map coordinates of 1e6 would lose digits.
+        # Relative to one of the points: sums of map coordinates of 1e6 would lose digits.
         main = self.xyz[self.main_part]
         return main[0] + (main - main[0]).mean(axis=0)
 
@@ -101,11 +101,11 @@ class Instance:
 
     @cached_property
     def oriented_box(self) -> Box | None:
-        """A box of nearly the least volume around its main part (`boxes.oriented_box`); None without points."""
+        """A box of nearly minimal volume around its main part (`boxes.oriented_box`); None without points."""
         return oriented_box(self.xyz[self.main_part], self._up) if self.points else None
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
+        """JSON-able: everything but the points; instead of them their number, and the number of strays."""
         columns = (
             "id", "state", "points", "views", "masks", "agreement", "reliability", "visible_area", "part_of", "coarse",
         )  # fmt: skip
@@ -120,9 +120,9 @@ class Instance:
 
 
 class Instances(Sequence[Instance]):
-    """Row k is instance id k. ``scene.instances`` is one; `instance_table` makes others, of other words.
+    """Row k is instance id k. ``scene.instances`` is one; `instance_table` makes others, with other words.
 
-    Unlike a list's, its indices do not count from the end: -1 is the id of background, not the last instance.
+    Unlike a list's, its indices do not count from the end: -1 is background, not the last instance.
 
     >>> table = og.instance_table(cloud)  # of `LabelledCloud`'s example
     >>> [row.id for row in table.largest(1)], len(table.to_records())
@@ -142,7 +142,7 @@ class Instances(Sequence[Instance]):
     @overload
     def __getitem__(self, index: slice) -> Instances: ...
     def __getitem__(self, index: SupportsIndex | slice) -> Instance | Instances:
-        """The instance with this id, or a table of several. IndexError for an id that is no instance's."""
+        """The instance with this id, or a table of a slice. IndexError for an id without an instance."""
         if isinstance(index, slice):
             return Instances(self._rows[index])
         row = operator.index(index)
@@ -154,23 +154,23 @@ class Instances(Sequence[Instance]):
         return self._rows[row]
 
     def largest(self, count: int | None = None) -> Instances:
-        """By falling number of points, of equals the smaller id first; only the first ``count``, 0 or more."""
+        """Sorted by falling number of points, ties by id; only the first ``count``, 0 or more."""
         if count is not None and count < 0:
             raise OgPointcloudError(f"count is {count}; expected 0 or more, or None for all")
         return Instances(sorted(self._rows, key=lambda row: (-row.points, row.id))[:count])
 
     def to_records(self) -> list[dict[str, Any]]:
-        """A JSON-able dictionary a row (`Instance.to_dict`)."""
+        """A JSON-able dictionary per row (`Instance.to_dict`)."""
         return [row.to_dict() for row in with_boxes(self)]
 
     def to_json(self, path: StrPath | None = None) -> str:
-        """The records as JSON text; also written to path, whole or not at all, where one is given."""
+        """The records as JSON text; also written to path, atomically, if one is given."""
         text = json.dumps(self.to_records(), indent=2, ensure_ascii=False) + "\n"
         _write(path, text)
         return text
 
     def to_csv(self, path: StrPath | None = None) -> str:
-        """The records as CSV text, a column a number; also written to path, whole or not at all."""
+        """The records as CSV text, one column per number; also written to path, atomically, if one is given."""
         text = csv_text([_flat(record) for record in self.to_records()])
         _write(path, text)
         return text
@@ -180,7 +180,7 @@ class Instances(Sequence[Instance]):
             "id", "points", "views", "agreement", "reliability", "state", "centroid", "size along x, y, z",
             "best words",
         )  # fmt: skip
-        shown = self.largest(SHOWN)
+        shown = self.largest(MAX_ROWS_SHOWN)
         rows = [header, *(_cells(row) for row in shown)]
         widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
         lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -190,13 +190,13 @@ class Instances(Sequence[Instance]):
 
 
 def with_boxes(rows: Iterable[Instance]) -> list[Instance]:
-    """The rows, which keep their oriented boxes from now on: all at once takes half the time of one after the other."""
+    """The rows, with their oriented boxes computed together, which takes half the time of one after the other."""
     rows = list(rows)
-    asked = [row for row in rows if row.points and "oriented_box" not in vars(row)]
-    for up in {id(row._up): row._up for row in asked}.values():
-        alike = [row for row in asked if row._up is up]
-        boxes = oriented_boxes([row.xyz[row.main_part] for row in alike], up)
-        for row, box in zip(alike, boxes, strict=True):
+    missing = [row for row in rows if row.points and "oriented_box" not in vars(row)]
+    for up in {id(row._up): row._up for row in missing}.values():
+        same_up = [row for row in missing if row._up is up]
+        boxes = oriented_boxes([row.xyz[row.main_part] for row in same_up], up)
+        for row, box in zip(same_up, boxes, strict=True):
             vars(row)["oriented_box"] = box
     return rows
 
@@ -207,19 +207,19 @@ def list_instances(
     labels: Vocabulary | None = None,
     *,
     up: ArrayLike | None = None,
-    words: int = WORDS,
+    words: int = WORDS_PER_ROW,
 ) -> Instances:
-    """The instances of a cloud as a table (`instance_table` takes whatever names a scene).
+    """The instances of a cloud as a table (`instance_table` also takes a scene or a path).
 
-    chooser: of the same cloud. labels: the words to choose among, None for none. up: (3,) direction that the oriented
-    boxes stand upright on, where it is known. words: how many a row names.
+    chooser: of the same cloud. labels: the words to choose among, None for none. up: (3,) upward direction of the
+    oriented boxes, if known. words: number of words per row.
     """
     if not isinstance(words, Integral) or isinstance(words, bool) or words < 0:
         raise OgPointcloudError(f"words is {words!r}; expected how many a row names, from 0")
     if up is not None:
-        unit_up(up)  # said now, not at the first box
-    # Points sorted by id, those of one id in their own order: each instance's points are one slice. Negative ids come
-    # before the first.
+        unit_up(up)  # raises now, not at the first box
+    # Points sorted by id, in their own order within an id: each instance's points are one slice. Negative ids come
+    # first.
     table, order = cloud.instances, np.argsort(cloud.instance_ids, kind="stable")
     bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
     described = np.zeros(len(table), bool)
@@ -264,7 +264,7 @@ def _cells(row: Instance) -> tuple[str, ...]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """A record without nesting: one column a number, e.g. centroid_0, and none for what is not known."""
+    """A record without nesting: one column per number, e.g. centroid_0; unknown values are left out."""
     if isinstance(value, dict):
         parts = value.items()
     elif isinstance(value, list):

@@ -1,9 +1,9 @@
-"""Text in, labels out: opens a .ogpc and asks it about points. numpy and onnxruntime, nothing else.
+"""Text in, labels out: opens a .ogpc file and queries it for points. Needs numpy and onnxruntime alone.
 
-``segment`` is one statement a step: which scene, which words, which instance each point belongs to, which word fits
-each instance, if any. Words are judged by ``choosing``, against the scene's word bank if it has one. Points are looked
-up by query.onnx. For the few close to a border, where its table does not promise the answer, ``nearest`` searches the
-cloud. A scene in memory has no graph: every point is searched for, with the same answers.
+``segment`` finds the scene, then the words, then the instance of each point, then the word that fits each instance, if
+any. ``choosing`` judges words, against the scene's word bank if it has one. query.onnx looks points up; for the few
+close to a border, where its table does not guarantee the answer, ``nearest`` searches the cloud. A scene in memory has
+no graph: every point is searched for, with the same result.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.ask.hosts import carried_scene, import_plugin, world_points
-from og_pointcloud.ask.instances import WORDS, Instances, list_instances
+from og_pointcloud.ask.instances import WORDS_PER_ROW, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.bundle.nearest import NearestPoint
@@ -31,7 +31,7 @@ from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError, counted, span
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.scene import (
-    RIGID,
+    ROTATION_TOLERANCE,
     DoubleArray,
     FloatArray,
     IntArray,
@@ -45,25 +45,25 @@ from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | StrPath"
 
-ELSEWHERE_SHARE = 1 / 3
-"""Where more than this share of the points asked lies too far from the scene, the two may be in different frames."""
-LOOKED_AT, FEWEST_JUDGED = 1000, 100
-"""About so many points of a cloud, evenly spread, tell whether its unit and its precision fit the scene; fewer than the
-second number say nothing."""
-WIDE = 10
-"""A scene so many times as wide as its reach is more than what a cloud within that reach would show of it."""
+MISPLACED_SHARE = 1 / 3
+"""If more than this share of the query points is too far from the scene, the two may be in different frames."""
+SAMPLE_POINTS, MIN_SAMPLE_POINTS = 1000, 100
+"""About so many evenly spread points of a cloud tell whether its unit and precision fit the scene; fewer than the
+second number tell nothing."""
+WIDE_SCENE_REACHES = 10
+"""A cloud narrower than the reach, in a scene wider than this many reaches, is probably in another unit."""
 POINTS_PER_RUN = 1 << 20
-"""Points given to the graph at once, which keeps its memory to about 150 MB."""
+"""Points given to the graph at once, which limits its memory to about 150 MB."""
 
 
 class LabelledScene:
-    """A labelled cloud that can be asked. Make one with ``load``; it is cheap to keep and safe to share by threads.
+    """A labelled cloud to query. Made by ``load``; cheap to keep and thread-safe.
 
-    cloud: points in the local frame, their instance ids, and what is known of the instances. path: the .ogpc file, and
-    manifest: the file's, with counts, parity figures, provenance; None and empty for a scene in memory.
-    instance_ids: (n,) int32, row of ``instances``, -1 background, -2 unobserved. vocabulary: the words that may be
-    asked as strings, None without any. feature_space: name of the encoder that label vectors must come from.
-    Its own arrays are read-only, as every later answer is made of them: Open3D's Vector3dVector wants `xyz.copy()`.
+    cloud: points in the local frame, their instance ids, and the instance table. path, manifest: the .ogpc file and its
+    manifest with counts, parity figures, provenance; None and empty for a scene in memory.
+    instance_ids: (n,) int32, row of ``instances``, -1 background, -2 unobserved. vocabulary: words that can be given
+    as strings, None if there are none. feature_space: name of the encoder that label vectors must come from.
+    Its arrays are read-only, as later answers depend on them: Open3D's Vector3dVector needs `xyz.copy()`.
 
     >>> scene = og.LabelledScene.from_cloud(cloud)  # of `LabelledCloud`'s example; og.load reads a file
     >>> scene.instances_at(np.array([[0.02, 0, 1], [1, 0.1, 1], [9, 9, 9]]))
@@ -87,13 +87,13 @@ class LabelledScene:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Other processes are sent what the file holds, not the open session: each opens its own."""
+        """Pickles the file's content, not the open session: each process opens its own."""
         return LabelledScene, (self._bundle,)
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
-        """A scene of a cloud that was never written. It answers as its file would. The first answer comes sooner, as no
-        graph is opened; many points take longer, as each is searched for."""
+        """A scene of a cloud that was never written to a file; its answers are the same. The first one comes sooner, as
+        no graph is opened; many points take longer, as each is searched for."""
         return cls(Bundle(None, cloud, None, {}))
 
     @cached_property
@@ -109,51 +109,49 @@ class LabelledScene:
 
     @cached_property
     def instances(self) -> Instances:
-        """The instances as a table: row k is instance id k, with its place, boxes, size, evidence and best own words.
-
-        Whole columns, and the descriptors, are in ``cloud.instances``.
-        """
+        """The instances as a table: row k is instance id k, with its position, boxes, size, evidence and best words of
+        the scene's vocabulary. Whole columns, and the descriptors, are in ``cloud.instances``."""
         return instance_table(self)
 
     def show(self, labels: Labels = None, *, text_features: TextFeatures = None) -> Any:
-        """A live page of the scene, which a notebook shows in its cell; `og-pointcloud serve` for the command line.
+        """A live page of the scene, which a notebook shows in its cell; `og-pointcloud serve` on the command line.
 
-        labels, text_features: as for ``segment``. Returns at once: the page, which has a ``url``, ``wait`` and
+        labels, text_features: as for ``segment``. Returns at once with the page, which has ``url``, ``wait`` and
         ``stop``. Served to this machine alone. Needs the extra 'serve'.
         """
         return import_plugin("og_pointcloud.show.serve", "serve").show(self, labels, text_features=text_features)
 
     @cached_property
     def chooser(self) -> Chooser:
-        """Decides which label fits each instance, if any; calibrated where the scene has a word bank."""
+        """Decides which label fits each instance, if any; calibrated if the scene has a word bank."""
         return Chooser(self.cloud.instances, self.cloud.word_bank, feature_space=self.feature_space)
 
     def words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
-        """Labels with their vectors, as ``segment`` finds them: named, in a file, in the scene's own words, encoded."""
+        """Labels with their vectors, found as for ``segment``: given, from a file, the scene's own, or encoded."""
         encoder = carried_encoder(self.path)
         if isinstance(labels, Mapping):
             labels = {name: numbers_of(vector) for name, vector in labels.items()}
         return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder)
 
     def known_words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
-        """The same, but no words where none are given and the scene has none."""
+        """The same, but an empty vocabulary if no words are given and the scene has none."""
         given = labels is not None or text_features is not None
         if given or (self.vocabulary and self.vocabulary.names):
             return self.words(labels, text_features)
         return Vocabulary((), np.zeros((0, self.cloud.space.width), np.float32))
 
     def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> IntArray:
-        """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
+        """(N,) int32: instance id of the scene point nearest to each point, -1, -2, or -3 if none is within reach.
 
         points: (N, 3), world coordinates. A row with NaN or infinity, as depth cameras send them, is out of reach.
-        max_distance: a shorter reach, in the scene's unit; costs an exact search of every point.
-        Exact: of points equally near the first one counts, and a point of the scene finds its own id.
+        max_distance: a shorter reach, in the scene's unit; costs an exact search for every point.
+        Exact: among equally near points the first one wins, and a point of the scene finds its own id.
         """
         self.check_distance(max_distance)
         return self._instances_at(self._local(points), max_distance)
 
     def _instances_at(self, local: FloatArray, max_distance: float | None) -> IntArray:
-        """The same of points (N, 3) in the cloud's frame."""
+        """The same for points (N, 3) in the cloud's frame."""
         instances = np.empty(len(local), np.int32)
         for start in range(0, len(local), POINTS_PER_RUN):
             run = slice(start, start + POINTS_PER_RUN)
@@ -161,8 +159,8 @@ class LabelledScene:
         if max_distance is not None:
             within_reach = np.flatnonzero(instances != TOO_FAR)
             nearest = self.nearest.query(local[within_reach])
-            cut = within_reach[self.nearest.distance(local[within_reach], nearest) > max_distance]
-            instances[cut] = TOO_FAR
+            beyond = within_reach[self.nearest.distance(local[within_reach], nearest) > max_distance]
+            instances[beyond] = TOO_FAR
         return instances
 
     def check_distance(self, max_distance: float | None) -> None:
@@ -174,22 +172,22 @@ class LabelledScene:
             )
 
     def certainty_at(self, points: NDArray[np.floating]) -> FloatArray | None:
-        """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
-        the scene does not know it. points: (N, 3), world coordinates. An exact search of every point."""
+        """(N,) float32, certainty of the scene point nearest to each point, 0 if none is within reach; None if the
+        scene has no certainty. points: (N, 3), world coordinates. An exact search for every point."""
         return self.certainty if points is self.xyz else self._certainty_at(self._local(points))
 
     def _certainty_at(self, local: FloatArray) -> FloatArray | None:
-        """The same of points (N, 3) in the cloud's frame."""
+        """The same for points (N, 3) in the cloud's frame."""
         if self.certainty is None:
             return None
-        of_points = np.append(self.certainty, np.float32(0))
+        by_point = np.append(self.certainty, np.float32(0))
         certainty = np.zeros(len(local), np.float32)
         finite = np.isfinite(local).all(axis=1)
-        certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the added 0
+        certainty[finite] = by_point[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the appended 0
         return certainty
 
     def _local(self, points: NDArray[np.floating]) -> FloatArray:
-        """(N, 3) in the cloud's frame; infinite where that leaves float32."""
+        """(N, 3) float32 in the cloud's frame; infinite where float32 overflows."""
         given = numbers_of(points)
         if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
             raise OgPointcloudError(
@@ -199,23 +197,23 @@ class LabelledScene:
         points = np.asarray(given, np.float64)
         local = np.empty(points.shape, np.float32)
         with np.errstate(over="ignore"):
-            for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own
+            for axis in range(3):  # three times as fast as all at once, which makes a float64 copy
                 np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
         return local
 
     def _look_up(self, local: FloatArray) -> IntArray:
-        """(N,) instance of each point: the graph's answer where it is certain, else by exact search. local: (N, 3)."""
+        """(N,) instance of each point: the graph's answer if it is certain, else by exact search. local: (N, 3)."""
         if self._graph is None:
-            instances, still_open = np.full(len(local), TOO_FAR, np.int32), np.arange(len(local))
+            instances, pending = np.full(len(local), TOO_FAR, np.int32), np.arange(len(local))
         else:
             instances, certain = self._graph.look_up(local)
             if certain.all():
                 return instances
-            still_open = np.flatnonzero(~certain)
-        still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
-        # One value more than points: NONE_WITHIN_REACH is -1 and reads TOO_FAR.
-        nearest = self.nearest.query(local[still_open])
-        instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
+            pending = np.flatnonzero(~certain)
+        pending = pending[np.isfinite(local[pending]).all(axis=1)]  # the others are too far already
+        # NONE_WITHIN_REACH, -1, reads the appended TOO_FAR.
+        nearest = self.nearest.query(local[pending])
+        instances[pending] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
         return instances
 
     @cached_property
@@ -225,7 +223,7 @@ class LabelledScene:
 
     @cached_property
     def nearest(self) -> NearestPoint:
-        """Index of the scene's point nearest to points of the local frame, within the reach."""
+        """Finds the scene point nearest to points of the local frame, within reach."""
         return NearestPoint(self.cloud.xyz, self.cloud.spacing, self.cloud.reach)
 
 
@@ -249,19 +247,19 @@ def segment(
     text_features: TextFeatures = None,
     max_distance: float | None = None,
 ) -> Segmentation:
-    """Label the points of a cloud by words. The cloud may be of any density, a crop, noisy, or in a frame of its own.
+    """Label the points of a cloud by words. The cloud may have any density or frame, and may be cropped or noisy.
 
-    A scene with a word bank (``scene.cloud.word_bank``) answers probabilities, and unknown where no label is probable;
-    one without answers the label with the largest cosine. The result says which (``calibrated``), and why a point is
-    unknown (``reasons``).
+    With a word bank (``scene.cloud.word_bank``), scores are probabilities, and a point is unknown if no label is
+    probable; without one, each point gets the label with the largest cosine. The result says which (``calibrated``),
+    and why a point is unknown (``reasons``).
 
     pcd: an array (N, 3) of world coordinates, a cloud or mesh of Open3D, PyVista or trimesh, a geometry file; or a
-        scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
-    scene: what to ask. Left out: the scene that the cloud is or carries.
-    pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
-    labels, text_features, max_distance: as for ``Segmenter``, which asks the same of many clouds.
+        scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN are unknown.
+    scene: the scene to query. Left out: the scene that the cloud is or carries.
+    pose: (4, 4), maps the cloud's coordinates to the scene's world. Left out: they are world coordinates.
+    labels, text_features, max_distance: as for ``Segmenter``, which labels many clouds by the same words.
 
-    Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
+    Warns if no point gets a label, and says why. Raises OgPointcloudError and its subclasses: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
 
     >>> result = og.segment([[0.02, 0, 1], [9, 9, 9]], ["desk", "chair"], cloud)  # of `LabelledCloud`'s example
@@ -277,13 +275,13 @@ def segment(
 class Segmenter:
     """The same labels for many clouds: words are scored once, and a call only looks points up.
 
-    Several threads may call it at once; memory does not grow from call to call.
+    Thread-safe; memory does not grow from call to call.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
         text encoder is found; or name -> vector (D,).
-    text_features: a text-features .npz, or what ``read_text_features`` returned for it.
-    max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
+    text_features: a text-features .npz, or the result of ``read_text_features`` for it.
+    max_distance: points farther than this from the scene's cloud are unknown; at most its reach, which is the default.
 
     >>> ask = og.Segmenter(cloud, ["desk", "chair"])  # of `LabelledCloud`'s example
     >>> for frame in (np.array([[0, 0, 1.0]]), np.array([[1, 0, 1.1], [0, 0, 0.9]])):
@@ -311,8 +309,8 @@ class Segmenter:
     def __call__(self, points: Any, pose: ArrayLike | None = None) -> Segmentation:
         """points: (N, 3) world coordinates, or any cloud that ``segment`` takes; N may be 0.
 
-        pose: (4, 4), takes the points to the scene's world, as a sensor's pose in the map does; ``xyz`` of the result
-        is then in the world too.
+        pose: (4, 4), maps the points to the scene's world, as a sensor's pose in the map does; ``xyz`` of the result
+        is then in world coordinates.
         Warns the first time that no point gets a label, not at every empty frame of a stream.
         """
         return self._answer(points, pose)
@@ -321,15 +319,15 @@ class Segmenter:
         scene = self.scene
         own = as_scene(pcd) if _is_scene(pcd) else None
         are_own = own is not None and own.cloud is scene.cloud and pose is None
-        if are_own:  # they need no look-up
+        if are_own:  # no look-up needed
             points, instances = scene.xyz.copy(), scene.instance_ids.copy()
             certainty_of = partial(scene.certainty_at, scene.xyz)
         else:
             points = _posed(world_points(pcd) if own is None else own.xyz.copy(), pose)
-            local = scene._local(points)  # it stays what was asked about, whatever becomes of the result's points
+            local = scene._local(points)  # a copy: a later change of the result's points does not change its certainty
             instances = scene._instances_at(local, self._max_distance)
             if self._max_distance is not None:
-                local[instances == TOO_FAR] = np.inf  # certainty has no shorter reach than the scene's
+                local[instances == TOO_FAR] = np.inf  # the certainty look-up knows only the scene's reach
             certainty_of = partial(scene._certainty_at, local)
         labels, scores, reasons = self._choice.at(instances)
         far = np.flatnonzero(instances == TOO_FAR)
@@ -338,9 +336,9 @@ class Segmenter:
             points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
             certainty_of,
         )  # fmt: skip
-        if not self._warned and (reason := _why_few(result, scene, are_own, pose)):
+        if not self._warned and (reason := _label_warning(result, scene, are_own, pose)):
             self._warned = True
-            warnings.warn(reason, stacklevel=3)  # where segment, or the segmenter, is called
+            warnings.warn(reason, stacklevel=3)  # at the call of segment, or of the segmenter
         return result
 
 
@@ -350,13 +348,13 @@ def instance_table(
     *,
     text_features: TextFeatures = None,
     up: ArrayLike | None = None,
-    words: int = WORDS,
+    words: int = WORDS_PER_ROW,
 ) -> Instances:
     """The instances of a scene as a table.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     labels, text_features: the words to choose among, as for ``segment``; left out, the scene's own, or none.
-    up: (3,) direction that the oriented boxes stand upright on, where it is known. words: how many a row names.
+    up: (3,) upward direction of the oriented boxes, if known. words: number of words per row.
 
     >>> [(row.id, row.points, row.words) for row in og.instance_table(cloud, words=1)]  # of `LabelledCloud`'s example
     [(0, 2, (('chair', 1.0),)), (1, 1, (('desk', 1.0),))]
@@ -371,7 +369,7 @@ def _is_scene(pcd: Any) -> bool:
 
 
 def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
-    """The scene that answers for a cloud: the one given, else that the cloud is or carries; else OgPointcloudError."""
+    """The scene to query for a cloud: the one given, else the one it is or carries; OgPointcloudError without any."""
     if scene is not None:
         return as_scene(scene)
     if _is_scene(pcd):
@@ -382,14 +380,14 @@ def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
 
 
 def as_scene(source: SceneLike) -> LabelledScene:
-    """A scene that can be asked, of whatever names one; the same again for a cloud or file that has not changed."""
+    """The scene of a LabelledCloud or path, or the scene given; cached for a cloud or file that has not changed."""
     if isinstance(source, LabelledScene):
         return source
     if isinstance(source, LabelledCloud):
         return _scene_once(source)
     if isinstance(source, (str, os.PathLike)):
         if not os.path.isfile(source):
-            return load(source)  # which says what is wrong
+            return load(source)  # raises an error that says what is wrong
         path = Path(source).resolve()
         state = path.stat()
         return _load_once(path, state.st_mtime_ns, state.st_size)
@@ -400,13 +398,13 @@ def as_scene(source: SceneLike) -> LabelledScene:
 
 @lru_cache(maxsize=2)
 def _load_once(path: Path, modified: int, size: int) -> LabelledScene:
-    """The scene of a file, read once as long as the file is unchanged."""
+    """The scene of a file, read once while the file is unchanged."""
     return load(path)
 
 
 @lru_cache(maxsize=2)
 def _scene_once(cloud: LabelledCloud) -> LabelledScene:
-    """The scene of a cloud in memory, made once: what it prepared for one question serves the next."""
+    """The scene of a cloud in memory, made once: what one query prepares serves the next."""
     return LabelledScene.from_cloud(cloud)
 
 
@@ -415,22 +413,22 @@ def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
         return points
     matrix = pose_matrix(pose)
     error, determinant = rotation_error(matrix[:3, :3])
-    if not error <= RIGID or determinant < 0:  # also where the error is NaN
+    if not error <= ROTATION_TOLERANCE or determinant < 0:  # also if the error is NaN
         raise SceneError(
             f"the rotation of pose is off a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a rigid "
             "pose: bring the points into the scene's unit first, and remove mirroring"
         )
-    with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay such
+    with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay so
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _why_few(result: Segmentation, scene: LabelledScene, are_own: bool, pose: ArrayLike | None) -> str | None:
-    """Why no point has a label, or that many lie elsewhere than the scene; None where neither is so. are_own: whether
-    they are the scene's own points."""
+def _label_warning(result: Segmentation, scene: LabelledScene, are_own: bool, pose: ArrayLike | None) -> str | None:
+    """Why no point has a label, or why labels may be wrong because points are misplaced; None if all is well. are_own:
+    whether they are the scene's own points."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
     far = int((result.reasons == Reason.TOO_FAR).sum())
-    cause = "" if are_own else _misplaced(result.xyz[result.reasons != Reason.NOT_FINITE], far, scene, pose)
+    cause = "" if are_own else _misplacement(result.xyz[result.reasons != Reason.NOT_FINITE], far, scene, pose)
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
@@ -438,26 +436,26 @@ def _why_few(result: Segmentation, scene: LabelledScene, are_own: bool, pose: Ar
     return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
-def _misplaced(points: DoubleArray, far: int, scene: LabelledScene, pose: ArrayLike | None) -> str:
-    """Why points, all finite, may not lie where the scene has them, "" if nothing says so. far: how many are too far
-    from it. pose: what brought them there."""
+def _misplacement(points: DoubleArray, far: int, scene: LabelledScene, pose: ArrayLike | None) -> str:
+    """Why finite points may be misplaced relative to the scene: precision, frame or unit; "" if nothing suggests it.
+    far: how many are too far from it. pose: the pose that was applied to them."""
     if len(scene.cloud) == 0:
         return ""
-    some = points[:: 1 + len(points) // LOOKED_AT]
-    many, spacing, reach = len(some) >= FEWEST_JUDGED, scene.cloud.spacing, scene.cloud.reach
-    if many and (step := float32_step(some)) > spacing:
+    sample = points[:: 1 + len(points) // SAMPLE_POINTS]
+    enough, spacing, reach = len(sample) >= MIN_SAMPLE_POINTS, scene.cloud.spacing, scene.cloud.reach
+    if enough and (step := float32_step(sample)) > spacing:
         return (
             f"float32 rounded them to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give them as "
             "float64, or take an offset off before they become float32, and give it in pose="
         )
     if pose is not None and (coarse := rounded_pose(pose, spacing)):
         return coarse
-    if far > ELSEWHERE_SHARE * len(points):
+    if far > MISPLACED_SHARE * len(points):
         return (
             f"the points span {span(points)}, the scene {span(scene.xyz)}, its reach is {reach:.4g}: bring them into "
             "the scene's frame and unit"
         )
-    if many and (width := _width(some)) < reach < _width(scene.cloud.xyz) / WIDE:
+    if enough and (width := _width(sample)) < reach < _width(scene.cloud.xyz) / WIDE_SCENE_REACHES:
         return (
             f"all of them lie within {width:.3g}, where the scene, {_width(scene.cloud.xyz):.4g} wide, has hardly two "
             "points: bring them into the scene's unit"

@@ -1,8 +1,8 @@
-"""A click selects an instance (Sec. 4.3): a pixel of a camera, or a place, -> instance, its points, its mask anywhere.
+"""Select an instance by a click (Sec. 4.3): a pixel or a 3D position -> instance, its points, its mask in any camera.
 
-numpy only. Points are drawn as squares; at each pixel the front surface wins, and on it the point that lies nearest to
-the pixel. One rule answers a click and makes a mask, so a picked instance's mask contains the pixel that was clicked.
-An image much finer than the cloud is drawn coarser and enlarged: its pixels show nothing more of the cloud.
+numpy only. Points are drawn as squares; at each pixel the front surface wins, and on it the point nearest to the pixel.
+Clicks and masks follow the same rule, so the mask of a picked instance contains the clicked pixel. For a camera much
+finer than the cloud, a coarser image is drawn and enlarged: more pixels would show nothing more.
 
 Frames. Everything here is in world coordinates, like ``scene.xyz``; a camera's ``world_to_camera`` maps from them.
 Views of a capture map from its local frame: ``in_world(view.camera, capture.points.origin)`` is the camera to pass.
@@ -27,14 +27,14 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.scene import Camera, numbers_of, rounded_pose
 from og_pointcloud.text.words import Labels, TextFeatures
 
-NEAR = 1.0
-"""Depth of the near plane in point spacings: nearer points would cover half the image each."""
-HALF_WIDTH = 0.7
-"""Half the side of a point's square, in point spacings: few gaps, and edges hardly fatter than what they show."""
-PIXELS_PER_SPACING = 2.0
-"""Pixels drawn for a point spacing, at most: two show all that there is of neighboring points."""
-WIDEST = 8
-"""Most pixels that a square has on each side of its middle: points much nearer than the others then leave gaps."""
+NEAR_PLANE_SPACINGS = 1.0
+"""Depth of the near plane, in point spacings: a nearer point would cover half the image."""
+HALF_SIDE_SPACINGS = 0.7
+"""Half the side of a point's square, in point spacings: few gaps, and outlines hardly dilated."""
+MAX_PX_PER_SPACING = 2.0
+"""Largest number of pixels drawn per point spacing: two resolve neighboring points."""
+MAX_HALF_SIDE_PX = 8
+"""Largest number of pixels of a square on each side of its middle: points much nearer than the others leave gaps."""
 NO_POINT = NONE_WITHIN_REACH
 
 _NOTHING_PICKED = {
@@ -46,8 +46,8 @@ _NOTHING_PICKED = {
 
 @dataclass(frozen=True, eq=False)
 class DrawnPoints:
-    """Points to draw that are no LabelledCloud's. xyz: (n, 3), world = xyz + origin. spacing: typical distance between
-    neighbors. reach: how thick a surface is, in the scene's unit."""
+    """Points to draw without a LabelledCloud. xyz: (n, 3), world = xyz + origin. spacing: typical distance between
+    neighbors. reach: thickness of a surface, in the scene's unit."""
 
     xyz: NDArray[np.float32]
     origin: NDArray[np.float64]
@@ -60,7 +60,7 @@ class Pick:
     """What a click hit.
 
     instance: id in the scene's table; or BACKGROUND (-1), UNOBSERVED (-2) or TOO_FAR (-3), a miss.
-    point: index of the scene's point that was hit, None for a miss. xyz_world: (3,) float64, its place, or None.
+    point: index of the scene point that was hit, None for a miss. xyz_world: (3,) float64, its position, or None.
 
     >>> hit = og.pick(cloud, (0.09, 0, 1))  # of `LabelledCloud`'s example
     >>> hit.instance, hit.point, hit.words()[0]
@@ -81,14 +81,14 @@ class Pick:
 
     @property
     def point_indices(self) -> NDArray[np.int64]:
-        """Indices of the instance's points in the scene, ascending. OgPointcloudError where no instance was hit."""
+        """Indices of the instance's points in the scene, ascending. OgPointcloudError if no instance was hit."""
         self._require_instance()
         return np.flatnonzero(self.scene.instance_ids == self.instance)
 
     def mask(self, camera: Camera) -> NDArray[np.bool_]:
-        """(H, W) bool: where the camera sees the instance, whatever hides it taken away.
+        """(H, W) bool: pixels at which the camera sees the instance; occluded parts are left out.
 
-        camera: maps from world coordinates (`in_world`). OgPointcloudError where no instance was hit.
+        camera: maps from world coordinates (`in_world`). OgPointcloudError if no instance was hit.
         """
         self._require_instance()
         front = front_points(self.scene.cloud, camera)
@@ -97,9 +97,9 @@ class Pick:
     def words(self, labels: Labels = None, *, text_features: TextFeatures = None) -> list[tuple[str, float]]:
         """Words with their scores on the instance, best first; empty for an instance without a descriptor.
 
-        A score is the probability that the instance is what the word says, where the scene has a word bank, else a
-        cosine. labels, text_features: as for ``segment``; left out, the scene's own words. OgPointcloudError where no
-        instance was hit, or as ``segment``.
+        A score is the probability that the instance is what the word says if the scene has a word bank, else a cosine.
+        labels, text_features: as for ``segment``; left out, the scene's own words. OgPointcloudError if no instance was
+        hit, or as ``segment``.
         """
         self._require_instance()
         words = self.scene.words(labels, text_features)
@@ -120,14 +120,14 @@ def pick(scene: SceneLike, where: Camera, uv_px: ArrayLike) -> Pick: ...
 @overload
 def pick(scene: SceneLike, where: ArrayLike) -> Pick: ...
 def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = None) -> Pick:
-    """Select the instance at a pixel of a camera, or at a place.
+    """Select the instance at a pixel of a camera, or at a 3D position.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     where: a camera that maps from world coordinates (`in_world`), with uv_px, (2,) pixels (column, row; pixel centers
-        at +0.5); or a place, (3,) world coordinates: the nearest point counts, if within the scene's reach.
+        at +0.5); or a position, (3,) world coordinates, which selects the nearest point within the scene's reach.
 
-    A miss is a Pick too: its ``instance`` says which kind, ``str(pick)`` in words. Raises OgPointcloudError for a pixel
-    outside the image and for numbers that are not finite. Warns of a camera whose pose float32 rounded.
+    A miss is also a Pick: its ``instance`` tells which kind, ``str(pick)`` in words. Raises OgPointcloudError for a
+    pixel outside the image and for numbers that are not finite. Warns of a camera pose that float32 has rounded.
 
     >>> camera = og.Camera(64, 48, 40.0, 40.0, 32.0, 24.0, np.eye(4))  # at the world's origin, along z
     >>> hit = og.pick(cloud, camera, (32, 24))  # of `LabelledCloud`'s example
@@ -149,7 +149,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
 
 
 def in_world(camera: Camera, origin: ArrayLike) -> Camera:
-    """A camera of a scene's local frame as one of world coordinates. origin: (3,), world = local + origin.
+    """A camera of a scene's local frame, converted to world coordinates. origin: (3,), world = local + origin.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
@@ -170,13 +170,13 @@ def front_points(cloud: LabelledCloud | DrawnPoints, camera: Camera) -> NDArray[
 
     camera: maps from world coordinates.
 
-    A point covers the pixels within HALF_WIDTH spacings of its own, at most WIDEST, along rows and columns. At each
-    pixel the nearest point begins the front surface, as thick as the scene's reach; within it the point whose pixel is
-    nearest wins, of equally near ones the rightmost, then the lowest; in one pixel the one nearest to the camera.
+    A point covers the pixels within HALF_SIDE_SPACINGS of its own, at most MAX_HALF_SIDE_PX, along rows and columns. At
+    each pixel the front surface starts at the nearest point and is as thick as the scene's reach. On it the point whose
+    pixel is nearest wins; ties go to the rightmost, then the lowest pixel, then to the point nearest to the camera.
     """
     squares, drawn = _squares(cloud, camera)
     # Each pixel of the camera shows the drawn pixel that its center falls into.
-    front = _in_front(squares, drawn.width, drawn.height, cloud.reach)
+    front = _front_points(squares, drawn.width, drawn.height, cloud.reach)
     rows = ((np.arange(camera.height) + 0.5) * drawn.height / camera.height).astype(np.intp)
     columns = ((np.arange(camera.width) + 0.5) * drawn.width / camera.width).astype(np.intp)
     return front[rows[:, None], columns]
@@ -194,7 +194,7 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
 
 
 def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
-    """Index of the nearest point within the scene's reach, the same that a query point would find, else NO_POINT."""
+    """Index of the nearest point within the scene's reach, the one that a query point finds, else NO_POINT."""
     world = numbers_of(place)
     if world.dtype.kind not in "fiu" or world.shape != (3,) or not np.isfinite(world).all():
         raise OgPointcloudError(f"the place is {place}; expected three finite world coordinates x, y, z")
@@ -203,59 +203,59 @@ def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
 
 @dataclass(frozen=True)
 class _Squares:
-    """Points as squares of pixels, from far to near; of those equally far, the lowest index last.
+    """Points as squares of pixels, from far to near; among equally far ones, the lowest index last.
 
-    index: (m,) in the cloud. pixel: (m, 2) column and row of the middle pixel. depth: (m,), in the scene's unit. half:
-    (m,) pixels covered on each side of the middle one.
+    index: (m,) in the cloud. pixel: (m, 2) column and row of the middle pixel. depth: (m,), in the scene's unit.
+    half_px: (m,) pixels covered on each side of the middle one.
     """
 
     index: NDArray[np.int64]
     pixel: NDArray[np.int64]
     depth: NDArray[np.float64]
-    half: NDArray[np.int64]
+    half_px: NDArray[np.int64]
 
 
 def _squares(cloud: LabelledCloud | DrawnPoints, camera: Camera) -> tuple[_Squares, Camera]:
-    """The squares that may touch the image, and the camera that they are drawn by, coarser for a coarse cloud."""
+    """The squares that may touch the image, and the camera that they are drawn in, coarser for a coarse cloud."""
     uv_px, depth = in_world(camera, -cloud.origin).project(cloud.xyz.astype(np.float64))
-    before = depth > NEAR * cloud.spacing
-    spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing / np.where(before, depth, np.inf)
-    inside = before & camera.shows(uv_px)
-    # The image is reduced until the median point in it has PIXELS_PER_SPACING pixels to a spacing.
-    shrink = max(1.0, float(np.median(spacing_px[inside])) / PIXELS_PER_SPACING) if inside.any() else 1.0
+    in_front = depth > NEAR_PLANE_SPACINGS * cloud.spacing
+    spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing / np.where(in_front, depth, np.inf)
+    inside = in_front & camera.shows(uv_px)
+    # The image is shrunk until the median spacing of the points in it is at most MAX_PX_PER_SPACING pixels.
+    shrink = max(1.0, float(np.median(spacing_px[inside])) / MAX_PX_PER_SPACING) if inside.any() else 1.0
     drawn = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
     size = np.array([drawn.width, drawn.height])
     scale = size / [camera.width, camera.height]
-    half = np.minimum(np.rint(HALF_WIDTH * spacing_px * np.sqrt(scale.prod())), WIDEST)
+    half = np.minimum(np.rint(HALF_SIDE_SPACINGS * spacing_px * np.sqrt(scale.prod())), MAX_HALF_SIDE_PX)
     uv_px = uv_px * scale
-    # A point beyond the border counts where its square may reach over it, with a pixel to spare.
-    index = np.flatnonzero(before & ((uv_px >= -half[:, None] - 1) & (uv_px <= size + half[:, None] + 1)).all(axis=1))
+    # A point outside the image counts if its square may reach into it, with a pixel to spare.
+    index = np.flatnonzero(in_front & ((uv_px >= -half[:, None] - 1) & (uv_px <= size + half[:, None] + 1)).all(axis=1))
     index = index[np.lexsort((-index, -depth[index]))]
     return _Squares(index, np.floor(uv_px[index]).astype(np.int64), depth[index], half[index].astype(np.int64)), drawn
 
 
-def _in_front(squares: _Squares, width: int, height: int, reach: float) -> NDArray[np.int64]:
-    """(height, width) the point that each pixel shows."""
+def _front_points(squares: _Squares, width: int, height: int, reach: float) -> NDArray[np.int64]:
+    """(height, width) index of the point that each pixel shows."""
     nearest, shown = np.full(width * height, -1), np.full(width * height, NO_POINT)
-    # First pass, where the front surface begins: squares go from far to near, so the largest number is the nearest.
+    # First pass, start of the front surface: squares are sorted from far to near, so the largest index is the nearest.
     for square, pixel in _covered(squares, width, height):
         ranks = np.full(width * height, -1)
         ranks[pixel] = square  # of several writes the last one stays: the nearest
         np.maximum(nearest, ranks, out=nearest)
-    surface = np.append(squares.depth, np.inf)[nearest] + reach  # -1, no square, reads infinity
-    # Second pass, who is shown: squares come by how far their middle is from the pixel, and the first one stays.
+    surface_end = np.append(squares.depth, np.inf)[nearest] + reach  # -1, no square, reads infinity
+    # Second pass, the point shown: squares come by distance of their middle from the pixel, and the first one stays.
     for square, pixel in _covered(squares, width, height):
-        wins = (shown[pixel] == NO_POINT) & (squares.depth[square] <= surface[pixel])
+        wins = (shown[pixel] == NO_POINT) & (squares.depth[square] <= surface_end[pixel])
         shown[pixel[wins]] = squares.index[square[wins]]
     return shown.reshape(height, width)
 
 
 def _covered(squares: _Squares, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Squares and a pixel (row-major) that each covers: first each one's middle, then pixels ever farther from it."""
-    widest = int(squares.half.max(initial=-1))
+    """Squares and one pixel (row-major) that each covers: first their middle pixels, then pixels ever farther away."""
+    widest = int(squares.half_px.max(initial=-1))
     steps = np.arange(-widest, widest + 1)
     for right, down in sorted(itertools.product(steps, steps), key=lambda step: step[0] ** 2 + step[1] ** 2):
         column, row = (squares.pixel + np.array([right, down])).T
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        square = np.flatnonzero(inside & (squares.half >= max(abs(right), abs(down))))
+        square = np.flatnonzero(inside & (squares.half_px >= max(abs(right), abs(down))))
         yield square, row[square] * width + column[square]

@@ -1,8 +1,8 @@
-"""query.onnx of a .ogpc file, asked for instances of points.
+"""Looks up the instances of points in query.onnx of a .ogpc file.
 
-Files come from anywhere. ``bundle.known_graph`` has settled what the graph may do; this module finds out whether it
-tells the truth: on opening, a sample of the file's own points and of places near them is looked up, drawn anew each
-time, and compared with the file's arrays.
+Files are untrusted. ``bundle.known_graph`` limits what the graph can do; this module checks that its answers are right:
+on opening, a new random sample of the file's points and of positions near them is looked up and compared with the
+file's arrays.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from og_pointcloud.errors import BundleError, first_line
 from og_pointcloud.models import open_session
 
 OUTPUTS = {"instance": np.int32, "certain": np.bool_}
-"""The graph's outputs that are used, one value a point each, and their types."""
-OWN_POINTS, PLACES = 4096, 8
-"""Points and places compared on opening. 4,096 random points miss a wrong thousandth of the cloud once in 60 openings,
-0.999^4096. Places are few: what they should answer is found by every distance, in time that grows with the cloud."""
+"""The graph's outputs that are used, one value per point each, and their types."""
+CHECKED_POINTS, CHECKED_PLACES = 4096, 8
+"""Points and positions beside them compared on opening. 4,096 random points miss a wrong thousandth of the cloud once
+in 60 openings, 0.999^4096. Positions are few: their nearest points are found by brute force, in time linear in the
+cloud."""
 
 
 class QueryGraph:
-    """The look-up of a .ogpc file. Several threads may ask it at once.
+    """The look-up of a .ogpc file. Thread-safe.
 
-    onnx: the serialized graph. path: its file, for errors. cloud: what the file's arrays say.
-    BundleError for a graph that does not run or answers otherwise than the arrays; also of later calls, where it
-    answers what no graph of ours would.
+    onnx: the serialized graph. path: its file, for errors. cloud: the content of the file's arrays.
+    BundleError for a graph that does not run or contradicts the arrays; later calls raise it for answers that no graph
+    of ours gives.
     """
 
     def __init__(self, onnx: bytes, path: Path | None, cloud: LabelledCloud) -> None:
@@ -50,7 +51,7 @@ class QueryGraph:
             self._compare(cloud, np.random.default_rng())
 
     def look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-        """Instance id, and whether it is certain, (N,) each. local: (N, 3), the cloud's frame."""
+        """Instance ids, and whether each is certain, (N,) each. local: (N, 3), the cloud's frame."""
         try:
             answers = self._session.run(list(OUTPUTS), {"points": local, "text": self._no_text})
         except Exception as error:  # onnxruntime raises types of its own
@@ -59,22 +60,22 @@ class QueryGraph:
         for values, dtype in zip((instances, certain), OUTPUTS.values(), strict=True):
             if values.shape != (len(local),) or values.dtype != dtype:
                 raise self._refused(f"answers {values.dtype} {values.shape} for {len(local)} points")
-        # Callers index arrays by these numbers: one that is no instance's must not get that far.
+        # Callers index arrays by these ids: an invalid one must not get that far.
         if len(local) and not (instances.min() >= TOO_FAR and instances.max() < self._instances):
             raise self._refused("answers what is no instance of this file")
         return instances, certain
 
     def _compare(self, cloud: LabelledCloud, random: np.random.Generator) -> None:
-        """BundleError where the graph contradicts the arrays. A right graph passes, whatever is drawn."""
-        rows = random.integers(0, len(cloud), OWN_POINTS)
+        """BundleError if the graph contradicts the arrays. A correct graph passes for every random sample."""
+        rows = random.integers(0, len(cloud), CHECKED_POINTS)
         instances, certain = self.look_up(cloud.xyz[rows])
         differ = np.flatnonzero(certain & (instances != cloud.instance_ids[rows]))
-        # A point that differs is not wrong yet: of points in one place the first one counts. It is judged as a place.
-        # Other places lie half a spacing off a point, where the nearest one is not obvious.
-        places = cloud.xyz[rows[:PLACES]] + random.normal(size=(PLACES, 3)) * (0.5 * cloud.spacing)
-        places = np.concatenate([cloud.xyz[rows[differ[:PLACES]]], places.astype(np.float32)])
+        # A point that differs need not be wrong, as the first of coincident points counts: it is checked as a position.
+        # Other positions lie half a spacing off a point, where the nearest one is not obvious.
+        places = cloud.xyz[rows[:CHECKED_PLACES]] + random.normal(size=(CHECKED_PLACES, 3)) * (0.5 * cloud.spacing)
+        places = np.concatenate([cloud.xyz[rows[differ[:CHECKED_PLACES]]], places.astype(np.float32)])
         instances, certain = self.look_up(places)
-        expected = np.array([_instance_plainly(cloud, place) for place in places])
+        expected = np.array([_brute_force_instance(cloud, place) for place in places])
         if wrong := int((certain & (instances != expected)).sum()):
             raise self._refused(f"contradicts the file's own points and ids in {wrong} of {len(places)} places")
 
@@ -82,12 +83,11 @@ class QueryGraph:
         return BundleError(f"{self._path}: query.onnx {what}: write the file again")
 
 
-def _instance_plainly(cloud: LabelledCloud, place: NDArray[np.float32]) -> int:
-    """Instance of the nearest point within reach, of equally near ones the first's: by every distance, in float64."""
-    at = place.astype(np.float64)
-    # A coarse sieve along x, wide enough for float32's rounding; the distances below are the answer.
+def _brute_force_instance(cloud: LabelledCloud, place: NDArray[np.float32]) -> int:
+    """Instance of the nearest point within reach, the first of equally near ones, from all distances in float64."""
+    # A coarse filter along x, wide enough for float32's rounding; the distances below decide.
     close = np.flatnonzero(np.abs(cloud.xyz[:, 0] - place[0]) <= 2 * cloud.reach)
-    x, y, z = (cloud.xyz[close].astype(np.float64) - at).T
+    x, y, z = (cloud.xyz[close].astype(np.float64) - place.astype(np.float64)).T
     squared = (x * x + y * y) + z * z
     if len(close) == 0 or squared.min() > float(cloud.reach) ** 2:
         return TOO_FAR

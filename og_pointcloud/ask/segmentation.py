@@ -1,4 +1,4 @@
-"""What a segment call returns: a label, score and instance per point, and ways to look at it."""
+"""The result of ``segment``: a label, score and instance per point, and ways to view, convert and save them."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points
 
-SHOWN = 12
-"""Labels that a printed result names."""
+MAX_LABELS_SHOWN = 12
+"""Labels listed in a printed result."""
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
-"""Endings of the files that a result is written to."""
+"""Suffixes of the files that a result can be saved as."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """One row a point, in the order of the points asked about.
+    """One row per point, in the order of the query points.
 
     xyz: (N, 3) float64, world coordinates. labels: (N,) int32, row of ``names``, -1 unknown.
     scores: (N,) float32, 0 where unknown; else, if ``calibrated``, the probability that the point is what its label
-        says; if not, the cosine of the label's text with the instance's descriptor, which has no such meaning.
+        says; if not, the cosine of the label's text with the instance's descriptor, which is no probability.
     instances: (N,) int32, the scene's instance id, -1 background, -2 unobserved, -3 too far from the scene.
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
-    names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
-    calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
-        badly it fits: then nothing is unknown for Reason.NONE_FITS.
-    certainty_of: what ``certainty`` reads: (N,) float32, or a function that looks it up; None if it is not known.
+    names: the given labels. scene: the .ogpc file queried, None for a scene in memory.
+    calibrated: whether the scene has a word bank to judge labels by. Without one each point gets the best label,
+        however badly it fits: then Reason.NONE_FITS does not occur.
+    certainty_of: source of ``certainty``: (N,) float32, or a function that looks it up; None if it is not known.
 
     All arrays are the result's own: changing them changes no scene.
 
@@ -64,15 +64,14 @@ class Segmentation:
         return len(self.labels)
 
     def __getstate__(self) -> dict[str, Any]:
-        """With its certainty, in place of the scene that would be asked for it."""
+        """Pickled with its certainty, in place of the function that looks it up in the scene."""
         return {**vars(self), "certainty_of": self.certainty}
 
     def __repr__(self) -> str:
-        """How many points have each label, the most frequent first, and why the others have none; and whether labels
-        had to fit."""
+        """Points per label, the most frequent first, and per reason for having none; and whether labels had to fit."""
         frequent = sorted(((name, count) for name, count in self.counts().items() if count), key=lambda row: -row[1])
-        rows = [(name, f"{count:,}") for name, count in frequent[:SHOWN]]
-        if rest := frequent[SHOWN:]:
+        rows = [(name, f"{count:,}") for name, count in frequent[:MAX_LABELS_SHOWN]]
+        if rest := frequent[MAX_LABELS_SHOWN:]:
             rows.append((f"{len(rest)} more labels", f"{sum(count for _, count in rest):,}"))
         rows += [(f"unknown, {reason}", f"{count:,}") for reason, count in self.unknown_because().items()]
         name_width = max((len(name) for name, _ in rows), default=0)
@@ -83,17 +82,16 @@ class Segmentation:
 
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:
-        """(N,) float32 in [0, 1]: how far views and neighbors bear out that a point is in its instance, or in none, as
-        the scene's nearest point has it; 0 where no view saw it or the scene is too far. Looked up when it is first
-        read, for the points that were asked about.
+        """(N,) float32 in [0, 1]: how well views and neighbors support that the nearest scene point is in its instance,
+        or in none; 0 if no view saw it or the scene is too far. Looked up on first access, for the query points.
 
-        ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
-        borders, and where masks disagree. None where the scene does not know it.
+        ``scores`` tell whether the instance is what the word means, this whether the point is part of it: low at
+        borders, and where masks disagree. None if the scene has no certainty.
         """
         certainty = self.certainty_of() if callable(self.certainty_of) else self.certainty_of
         if certainty is None:
             return None
-        if len(certainty) != len(self):  # rows were chosen by dataclasses.replace
+        if len(certainty) != len(self):  # rows were selected by dataclasses.replace
             raise OgPointcloudError(
                 f"certainty is of {len(certainty):,} points, the result has {len(self):,}; expected one a point: give "
                 "the rows' as certainty_of"
@@ -107,25 +105,25 @@ class Segmentation:
         return self.labels == self.names.index(name)
 
     def counts(self) -> dict[str, int]:
-        """Points of each name, in the order of ``names``; the remaining ones are unknown."""
+        """Number of points of each name, in the order of ``names``; the remaining points are unknown."""
         counts = np.bincount(self.labels + 1, minlength=len(self.names) + 1)[1:]
         return dict(zip(self.names, counts.tolist(), strict=True))
 
     def unknown_because(self) -> dict[Reason, int]:
-        """Points without a label by the reason for it, reasons that no point has left out."""
+        """Number of points without a label for each reason; reasons without points are left out."""
         counts = np.bincount(self.reasons, minlength=len(Reason))
         return {reason: int(counts[reason]) for reason in Reason if reason != Reason.LABELLED and counts[reason]}
 
     @property
     def colors(self) -> NDArray[np.uint8]:
-        """(N, 3) uint8 RGB: a color a label, gray where unknown."""
+        """(N, 3) uint8 RGB: one color per label, gray where unknown."""
         return label_colors(self.labels)
 
     @property
     def attributes(self) -> dict[str, NDArray[Any]]:
-        """What hosts and files keep of each point: (N,) arrays, by the same names in all of them.
+        """Per-point attributes of hosts and files: (N,) arrays, with the same names in all of them.
 
-        og_label, og_instance int32, og_score float32, og_reason uint8, as some of them have no int8.
+        og_label, og_instance int32, og_score float32, og_reason uint8, as some formats have no int8.
         """
         return {
             "og_label": self.labels,
@@ -147,18 +145,18 @@ class Segmentation:
         return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
 
     def save(self, path: StrPath, splats: Points | None = None, source: StrPath | None = None) -> Path:
-        """Write the result, whole or not at all, as what the path's ending says.
+        """Write the result atomically, in the format of the path's suffix.
 
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
         .ply: a colored cloud with the `attributes`.
         .las, .laz: with colors, classification and the attributes as extra bytes (needs the extra 'las').
         .glb: colored points, or splats, with feature ids and names.
-        .spz: splats in the labels' colors; the format has no place for labels.
-        splats: Gaussians, if the points asked about are some, row by row: `read_points` of their file.
-        source: the file that was asked about. From .las and .laz to .las and .laz, all that it says of its points
-            stays, and so does its coordinate system; only labels are added.
-        OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
-        room for NaN, .glb none for an empty cloud.
+        .spz: splats in the labels' colors; the format cannot hold labels.
+        splats: the Gaussians, row by row, if the query points were Gaussians: `read_points` of their file.
+        source: the file that was labelled. From .las or .laz to .las or .laz, its point attributes and coordinate
+            system are kept, and only labels are added.
+        OgPointcloudError for another suffix; SceneError if the format cannot hold the points: .las and .glb cannot hold
+        NaN, .glb no empty cloud.
         """
         if not isinstance(path, (str, os.PathLike)):
             raise OgPointcloudError(

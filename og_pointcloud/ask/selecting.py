@@ -1,7 +1,7 @@
-"""Words select instances: all of them ranked by one text, and which the text fits.
+"""Select instances by words: ranks all instances by one text, and tells which ones it fits.
 
 A cosine alone says little: what counts as high differs from scene to scene and word to word. So the text competes with
-other words, and with the scene's word bank where it has one: an instance is selected where `segment` would label it so.
+other words, and with the scene's word bank if it has one: it selects the instances that `segment` would label with it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.boxes import Box
 from og_pointcloud.ask.choosing import Choice, Reason
-from og_pointcloud.ask.instances import SHOWN
+from og_pointcloud.ask.instances import MAX_ROWS_SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, counted
@@ -25,12 +25,12 @@ from og_pointcloud.text.words import Labels, TextFeatures
 
 @dataclass(frozen=True)
 class Match:
-    """An instance beside a text. points: how many it has.
+    """An instance compared with a text. points: its number of points.
 
-    score: the probability that it is what the text says, where the selection is calibrated; else their cosine.
-    fits: whether neither another word nor "none of these" is more probable. Where not calibrated: whether no other word
-    has a higher cosine; where no other word was given, whether it is the best of all.
-    rival: the other word that fits it best, with its score; None and -2 where no other word was given.
+    score: the probability that it is what the text says if the selection is calibrated, else their cosine.
+    fits: whether neither another word nor "none of these" is more probable. If not calibrated: whether no other word
+    has a higher cosine or, without other words, whether it is the best instance.
+    rival, rival_score: the other word that fits it best, and its score; None and -2 if no other word was given.
 
     >>> best = og.select(cloud, "desk").best  # of `LabelledCloud`'s example
     >>> best.instance, best.score, best.fits, best.rival
@@ -47,7 +47,7 @@ class Match:
 
     @property
     def oriented_box(self) -> Box | None:
-        """Where it is: `Instance.oriented_box` of its row in the scene's table of instances."""
+        """`Instance.oriented_box` of its row in the scene's table of instances."""
         return self._scene.instances[self.instance].oriented_box
 
     def to_dict(self) -> dict[str, Any]:
@@ -58,10 +58,10 @@ class Match:
 
 @dataclass(frozen=True)
 class Selection(Sequence[Match]):
-    """What a text selects: every instance that has points and a feature, best first, of equals the smaller id.
+    """Instances ranked by a text: all that have points and a feature, best first; ties go to the smaller id.
 
-    query: the text. rivals: how many other words competed. unknown: instances with points that have no feature, which
-    no text can find. calibrated: whether the scene has a word bank, and scores are probabilities.
+    query: the text. rivals: number of other words that competed. unknown: number of instances with points but without a
+    feature, which no text can find. calibrated: whether the scene has a word bank, so that scores are probabilities.
 
     >>> selection = og.select(cloud, "chair")  # of `LabelledCloud`'s example
     >>> selection.instances, selection.point_indices
@@ -88,12 +88,12 @@ class Selection(Sequence[Match]):
 
     @property
     def best(self) -> Match | None:
-        """The instance with the highest score, whether or not the text fits it; None without any."""
+        """The instance with the highest score, whether or not the text fits it; None if there is none."""
         return self.matches[0] if self.matches else None
 
     @property
     def fitting(self) -> tuple[Match, ...]:
-        """Those that the text fits; without rivals and word bank the best alone, as nothing tells more."""
+        """The matches that the text fits; without rivals or word bank only the best, as nothing tells more."""
         return tuple(match for match in self.matches if match.fits)
 
     @property
@@ -103,7 +103,7 @@ class Selection(Sequence[Match]):
 
     @property
     def point_indices(self) -> NDArray[np.int64]:
-        """(m,) the scene's points that belong to fitting instances, ascending."""
+        """(m,) indices of the scene's points in fitting instances, ascending."""
         return np.flatnonzero(np.isin(self.scene.instance_ids, self.instances))
 
     def to_json(self) -> str:
@@ -114,29 +114,28 @@ class Selection(Sequence[Match]):
 
     def __repr__(self) -> str:
         lines = [f"'{self.query}' fits {len(self.fitting)} of {counted(len(self), 'instance')}"]
-        for match in self[:SHOWN]:
+        for match in self[:MAX_ROWS_SHOWN]:
             mark = "*" if match.fits else " "
             rival = f"{match.rival} {match.rival_score:.3f}" if match.rival else "-"
             lines.append(
                 f"{mark} instance {match.instance:<5} {match.score:.3f}  {match.points:>9,} points  rival {rival}"
             )
-        if len(self) > SHOWN:
-            lines.append(f"and {len(self) - SHOWN} that it fits less")
+        if len(self) > MAX_ROWS_SHOWN:
+            lines.append(f"and {len(self) - MAX_ROWS_SHOWN} that it fits less")
         return "\n".join(lines)
 
 
 def select(
     scene: SceneLike, text: str | Mapping[str, ArrayLike], *, against: Labels = None, text_features: TextFeatures = None
 ) -> Selection:
-    """Rank the instances of a scene by a text, and say which it fits.
+    """Rank the instances of a scene by a text, and tell which ones it fits.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     text: a word or phrase, found as for ``segment``; or one name -> vector (D,).
-    against: the words that compete, as labels of ``segment``; left out, all others that text_features or the scene
-        know; an empty list for none but the word bank. Rivals that mean the same ("cup" for "mug") share the instances
-        between them.
+    against: the words that compete, as labels of ``segment``; left out, all other words of text_features or the scene;
+        an empty list for the word bank alone. Rivals with the same meaning ("cup" for "mug") share the instances.
 
-    Raises OgPointcloudError where text is not one word, else as ``segment``.
+    Raises OgPointcloudError if text is not one word or phrase, else as ``segment``.
 
     >>> [(match.instance, match.score) for match in og.select(cloud, "desk")]  # of `LabelledCloud`'s example
     [(1, 1.0), (0, 0.0)]
@@ -151,7 +150,7 @@ def select(
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
     known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
     ranked = [int(k) for k in choice.ranking(0) if known[k]]
-    # With neither rivals nor bank label 0 would fit every instance; the best one alone is then said to fit.
+    # With neither rivals nor bank, label 0 would fit every instance: then only the best one counts as fitting.
     fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals.names or choice.calibrated else ranked[:1])
     return Selection(
         query=query.names[0],
@@ -166,7 +165,7 @@ def select(
 def _match(
     scene: LabelledScene, instance: int, choice: Choice, fits: bool, rivals: Sequence[str], points: int
 ) -> Match:
-    """choice: among the query, label 0, and its rivals, the labels after it."""
+    """One instance's match. choice: label 0 is the query, the labels after it are its rivals."""
     score, rival, rival_score = float(choice.scores[instance, 0]), None, NO_EVIDENCE
     if rivals:
         best = int(choice.evidence[instance, 1:].argmax())
@@ -176,7 +175,7 @@ def _match(
 
 def _rivals(scene: LabelledScene, query: Vocabulary, against: Labels, text_features: TextFeatures) -> Vocabulary:
     """The words that compete with the query, without itself."""
-    if isinstance(against, Iterable) and not isinstance(against, Sized):  # it says how many it has only once
+    if isinstance(against, Iterable) and not isinstance(against, Sized):  # an iterator can be counted only once
         against = list(against)
     none_wanted = isinstance(against, Sized) and not len(against)  # []; None asks for all known words
     words = query if none_wanted else scene.known_words(against, text_features)

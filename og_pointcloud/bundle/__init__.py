@@ -1,4 +1,4 @@
-"""The .ogpc file as the runtime sees it: read and checked, its nearest points found, words added. numpy alone.
+"""The .ogpc file at runtime: reading and checking it, nearest-point search, adding words. Needs numpy alone.
 
-What writes one is `og_pointcloud_export`.
+`og_pointcloud_export` writes it.
 """

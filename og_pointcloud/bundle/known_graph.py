@@ -1,9 +1,8 @@
-"""The query.onnx that files of this schema version have, node for node: nothing else is ever run.
+"""Recognizes, node for node, the query.onnx of this schema version: no other graph is ever run.
 
-A digest settles what the nodes do. What differs from file to file is the contents of tables, whose names, types and
-ranks are settled too, and single numbers that nodes add, compare or multiply with. None of these can make an array
-larger: memory is bounded by the file's own bytes and by the question. Whether the graph tells the truth is found out by
-``ask.query_graph``.
+A digest fixes what the nodes do. Files differ only in the contents of tables, whose names, types and ranks are fixed
+too, and in single numbers that nodes add, compare or multiply with. None of these can enlarge an array: memory is
+bounded by the size of the file and of the query. ``ask.query_graph`` checks that the graph's answers are right.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ KNOWN_GRAPHS = frozenset({
     "0931f16d57ab1db72ec826a2b787e5f5", "278a9debe4359bb24c880b918dd953e8", "cd2b6be498a00464ad55884c286e2033",
     "5125ba60d69c8c34932f1c6f484a6e08", "d6b9de5009bf92436051be07f7985c7a", "b9731a6b2aa1345740ee322b1720fe8f",
 })  # fmt: skip
-"""`query_graph_digest` of the graph that `og_pointcloud_export.query_graph` builds, first, then of those that it built
-before, since schema version 2. A change of that graph adds its digest here, and removes none."""
+"""`query_graph_digest` of the graph that `og_pointcloud_export.query_graph` builds, then of those that it has built
+since schema version 2. A change of that graph adds its digest here, and removes none."""
 MODEL_FIELDS, GRAPH_FIELDS = {1, 2, 7, 8}, {1, 2, 5, 10, 11, 12}
 """Fields of onnx.proto3 that our graphs have. ModelProto: ir_version, producer_name, graph, opset_import. GraphProto:
 node, name, initializer, doc_string, input, output."""
-COUNT = "(answer codes)"
-"""Stands in the digest for the name of the constant that holds their number."""
+CODE_COUNT_INPUT = "(answer codes)"
+"""Placeholder in the digest for the name of the constant that holds the number of answer codes."""
 TABLES = frozenset({
     "axis_places", "block_shifts", "brick_values", "candidate_answer", "candidate_x", "candidate_y", "candidate_z",
     "candidates", "candidates_high", "candidates_low", "cell_values", "child_length", "child_start", "descriptor_code",
@@ -37,13 +36,13 @@ DTYPES = {1: "<f4", 2: "|u1", 3: "|i1", 4: "<u2", 6: "<i4", 7: "<i8", 11: "<f8",
 """numpy's types by TensorProto.DataType."""
 UNSIGNED = (2, 4, 12)
 FREE_OPERATORS = {6: ("Add", "Sub", "Less", "GreaterOrEqual", "Min", "Max"), 1: ("Mul",), 11: ("LessOrEqual",)}
-"""By TensorProto.DataType of a single number: operators in which it may be any. Its effect is one that other contents
-of a table could have as well, so nothing would be gained by settling it."""
+"""By TensorProto.DataType of a single number: operators in which it may have any value. Other contents of a table could
+have the same effect, so fixing it would gain nothing."""
 
 
 def query_tables(onnx: bytes) -> dict[str, NDArray[np.generic]]:
-    """The tables of a query graph by name, read-only views, and ``codes``, the number of answer codes that it counts
-    with. ValueError, which says why, for any other graph."""
+    """The tables of a query graph by name, read-only views, and ``codes``, its number of answer codes. ValueError says
+    why, for any other graph."""
     check_graph(onnx)
     digest, constants, codes = _parsed(onnx)
     if digest not in KNOWN_GRAPHS:
@@ -53,7 +52,7 @@ def query_tables(onnx: bytes) -> dict[str, NDArray[np.generic]]:
 
 
 def query_graph_digest(onnx: bytes) -> str:
-    """32 hexadecimal digits of all that may not differ between the graphs of two files."""
+    """32 hexadecimal digits: digest of everything that must be equal in the graphs of all files."""
     return _parsed(onnx)[0]
 
 
@@ -70,14 +69,19 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     nodes = [_Node(value) for number, value in graph if number == 1]
     # The first Concat makes the shape (answer codes, texts) of the table of scores.
     counting = next((node for node in nodes if node.operator == "Concat" and node.inputs), None)
-    # Two constants of one name, or one called COUNT, could stand in for one another in the digest.
-    if len(constants) != len(named) or COUNT in constants or counting is None or counting.inputs[0] not in constants:
+    # Two constants of one name, or one called CODE_COUNT_INPUT, could stand in for one another in the digest.
+    if (
+        len(constants) != len(named)
+        or CODE_COUNT_INPUT in constants
+        or counting is None
+        or counting.inputs[0] not in constants
+    ):
         raise ValueError("it does not count as graphs of ours do")
-    # What the digest is of: versions, tables by kind, inputs and outputs by name, and every node in order.
+    # The digest covers versions, tables by kind, inputs and outputs by name, and every node in order.
     lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]
     lines += sorted(f"{name} {_kind(constant)}" for name, constant in constants.items() if name in TABLES)
     lines += [f"{number} {text_of(value, 1)!r}" for number, value in graph if number in (11, 12)]
-    codes, counting.inputs[0] = constants[counting.inputs[0]], COUNT
+    codes, counting.inputs[0] = constants[counting.inputs[0]], CODE_COUNT_INPUT
     lines += [node.line(constants) for node in nodes]
     return blake2b("\n".join(lines).encode(), digest_size=16).hexdigest(), constants, codes
 
@@ -91,8 +95,8 @@ class _Node:
         self.attributes = [_hex(value) for number, value in fields if number == 5]
 
     def line(self, constants: dict[str, Constant]) -> str:
-        """All that the node does, as text. Inputs are named, but for constants that are no tables: those stand by their
-        value, or as "any" where it may differ."""
+        """The node's effect as text. Inputs appear by name, but constants that are no tables by their value, or as
+        "any" if it may differ."""
         inputs = [self._input(name, constants[name]) if name in constants else repr(name) for name in self.inputs]
         return f"{self.operator} {inputs} {self.outputs} {self.attributes}"
 
@@ -104,7 +108,7 @@ class _Node:
 
 
 def _kind(table: Constant) -> str:
-    """Type and rank. Unsigned types count as one: whole numbers are stored in the smallest that holds them."""
+    """Type and rank. All unsigned types count as one: whole numbers are stored in the smallest type that fits."""
     return f"{'unsigned' if table.kind in UNSIGNED else table.kind} {len(table.shape)}"
 
 

@@ -1,4 +1,4 @@
-"""A .ogpc file read without believing it; ``bundle.format`` says what is in one."""
+"""Reads a .ogpc file without trusting it; ``bundle.format`` describes its members."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.text.text_features import check_names
 
 ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
-"""All that zipfile raises for archives that are damaged, encrypted, or compressed in a way that it does not know."""
+"""All that zipfile raises for archives that are damaged, encrypted, or compressed in an unknown way."""
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a .ogpc holds.
+    """Content of a .ogpc file.
 
-    path, query_onnx: the file, and its serialized graph; None for a cloud that was never a file. manifest: as read;
-    what this library uses of it is checked.
+    path, query_onnx: the file, and its serialized graph; None for a cloud that was never a file. manifest: as read; the
+    fields that this library uses are checked.
     """
 
     path: Path | None
@@ -39,10 +39,10 @@ class Bundle:
 
 
 def read_bundle(path: StrPath) -> Bundle:
-    """Read and check a .ogpc file; BundleError, beginning with the path, for any other or damaged file.
+    """Read and check a .ogpc file; BundleError, whose text begins with the path, for any other or damaged file.
 
-    Each member's CRC-32 is checked. The manifest's sha256 digests are not: anyone can write them, so they tell files
-    apart but not whom to trust.
+    Each member's CRC-32 is checked. The manifest's sha256 digests are not: anyone can write them, so they identify
+    files but do not authenticate them.
 
     >>> import pathlib, tempfile
     >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
@@ -60,14 +60,14 @@ def read_bundle(path: StrPath) -> Bundle:
             members, carried = _members(file)
         manifest = _manifest(members)
         _check_members(manifest, members, carried)
-        # Only what is whole and declared is looked into, part by part, each held against what the others say.
+        # Only complete, declared members are parsed, and each is checked against the others.
         return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
 
 
 def read_carried_encoder(path: StrPath) -> dict[str, bytes] | None:
-    """The files of the text encoder that a .ogpc carries, by name, unchecked; None where it carries none."""
+    """The files of the text encoder that a .ogpc carries, by name, unchecked; None if it carries none."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -85,10 +85,10 @@ class _Refused(Exception):
 
 
 def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
-    """All members by name, but of a carried encoder the sizes only: most who open a file never need it.
+    """All members by name, and the sizes of a carried encoder's, which are rarely needed.
 
-    Members must be stored uncompressed and fit into the file together: reading them takes no more memory than it has
-    bytes.
+    Members must be stored uncompressed and fit into the file together, so reading them takes no more memory than the
+    file's size.
     """
     size = file.seek(0, os.SEEK_END)
     try:
@@ -99,7 +99,7 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
                 raise _Refused(f"member name {info.filename!r:.80} is no plain relative path: it is not to be trusted")
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
                 raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {ogpc.REBUILD}")
-        # Two members of one name, or overlapping ones, could say one thing to us and another to other readers.
+        # Members of the same name, or overlapping ones, could be read differently by other readers.
         names = {info.filename for info in infos}
         total = sum(info.file_size for info in infos)
         if len(names) != len(infos) or len(infos) > ogpc.MAX_MEMBERS or total > size:
@@ -147,7 +147,7 @@ def _json(members: dict[str, bytes], name: str, most: int) -> Any:
 
 
 def _check_members(manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int]) -> None:
-    # What zip says and what the manifest says are two lists of the same things: neither may have more.
+    # The zip directory and the manifest list the same members: neither may have more.
     declared = _field(manifest, "members", dict)
     sizes = {name: len(data) for name, data in members.items()} | carried
     if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
@@ -168,7 +168,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     xyz = _array(members, "arrays/xyz.npy", ("<f4",), (points, 3))
     if not np.isfinite(xyz).all():
         raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
-    ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGERS, (points,)).astype(np.int32)
+    ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGER_DTYPES, (points,)).astype(np.int32)
     ids.flags.writeable = False  # as all other arrays of a file are
     rgb = _array(members, ogpc.RGB, ("|u1",), (points, 3)) if ogpc.RGB in members else None
     certainty = _array(members, ogpc.CERTAINTY, ("|u1",), (points,)) if ogpc.CERTAINTY in members else None
@@ -201,12 +201,12 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
     columns: dict[str, NDArray[Any]] = {}
     for field in fields(InstanceTable):
         member = f"arrays/instances/{ogpc.INSTANCE_MEMBERS.get(field.name, field.name)}.npy"
-        if field.name == "descriptors" or (field.name in ogpc.LATER_COLUMNS and member not in members):
+        if field.name == "descriptors" or (field.name in ogpc.OPTIONAL_COLUMNS and member not in members):
             continue
         dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
         length = len(descriptors) if field.name == "descriptor_instance" else count
         columns[field.name] = _array(members, member, (dtype,), (length,))
-    # The columns that `segment` reads and the tables that the graph answers by must be the same numbers.
+    # The columns that `segment` reads and the tables of the graph must hold the same numbers.
     _check_graph(members["query.onnx"], descriptors, columns["descriptor_instance"], count)
     return InstanceTable(descriptors, **columns)
 
@@ -214,7 +214,7 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
 def _check_graph(
     onnx: bytes, descriptors: NDArray[np.float32], descriptor_instance: NDArray[np.int32], instances: int
 ) -> None:
-    """Refuse any graph but ours, and one whose scores would be of other descriptors than the manifest's."""
+    """Refuse any graph but ours, and one whose descriptors are not the manifest's."""
     try:
         tables = query_tables(onnx)
     except ValueError as error:
@@ -233,7 +233,7 @@ def _check_graph(
 
 
 def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
-    """(R, D) float32, a view into the constants of the graph: they are stored once."""
+    """(R, D) float32, a view of the graph's constants: descriptors are stored only once."""
     graph = members["query.onnx"]
     offset, shape = _field(place, "offset", int, "descriptors/"), _field(place, "shape", list, "descriptors/")
     # Both come from the file: no negative length and no offset may lead outside the graph's bytes.
@@ -255,14 +255,14 @@ def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabula
         check_names(names)
     except OgPointcloudError as error:
         raise _Refused(f"vocabulary/names.json: {error}") from None
-    vectors = _array(members, "vocabulary/vectors.npy", ogpc.FLOATS, (words, None))
+    vectors = _array(members, "vocabulary/vectors.npy", ogpc.FLOAT_DTYPES, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
 
 
 def _array(
     members: dict[str, bytes], name: str, dtypes: tuple[str, ...], shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """A read-only array over a member's bytes, of one of these types and this shape (None: any length)."""
+    """A read-only view of a member's bytes as an array of one of these types and this shape (None: any length)."""
     if name not in members:
         raise _Refused(f"member '{name}' is missing: {ogpc.REBUILD}")
     try:

@@ -1,7 +1,7 @@
-"""Words of a .ogpc file, and the bank that labels are judged by: stored with their vectors, so that whoever asks the
-file needs no encoder. ``scene_words`` finds them for a file that is being made.
+"""Words of a .ogpc file, and the bank that labels are judged by: stored with their vectors, so that queries need no
+encoder. ``scene_words`` finds them for a new file.
 
-Only the members that change are written anew, the graph and the arrays are copied: numpy is all this needs.
+Only changed members are written anew; the graph and the arrays are copied. Needs numpy alone.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, fin
 from og_pointcloud.text.text_features import check_names, checked_vocabulary, read_text_features
 
 CAPTURE_WORDS = {"text_features.npz": LeftOut.VOCABULARY, "word_bank.npz": LeftOut.WORD_BANK}
-"""Files of words that a capture folder may hold, and what a fit says where they are of another feature space."""
+"""Word files that a capture folder may contain, and what a fit reports if they are of another feature space."""
 
 
 @dataclass(frozen=True)
 class SceneWords:
-    """vocabulary: words that can be asked by name. word_bank: everyday words that labels are judged by. None: there are
-    none. left_out: entries of provenance["left_out"]."""
+    """vocabulary: words that can be given by name. word_bank: everyday words that labels are judged by. None if there
+    are none. left_out: entries of provenance["left_out"]."""
 
     vocabulary: Vocabulary | None = None
     word_bank: WordBank | None = None
@@ -55,24 +55,24 @@ def scene_words(
 ) -> SceneWords:
     """The words for a scene whose masks are of this feature space; cheap enough to be checked before a fit.
 
-    text_features: an .npz with the vocabulary; None: the capture folder's text_features.npz, if that is of this space.
-    word_bank: an .npz of at least 50 everyday words; None: the capture folder's word_bank.npz, if that is of this
-        space, else that of the text encoder found for the space, if any.
-    FeatureSpaceError where a file cannot be read, or one that was asked for is of another space or width.
+    text_features: an .npz with the vocabulary; None: the capture folder's text_features.npz, if it is of this space.
+    word_bank: an .npz of at least 50 everyday words; None: the capture folder's word_bank.npz, if it is of this
+        space, else the bank of the text encoder found for the space, if any.
+    FeatureSpaceError if a file cannot be read, or a given file is of another space or width.
     """
     left_out = []
 
-    def words_of(asked: StrPath | None, own: str, read: Callable[[Path], tuple[Any, str]]) -> Any:
-        """Of a file that was asked for, which must fit; else of the capture's own, which is left out if it does not."""
-        if asked is None and (capture is None or not (Path(capture) / own).is_file()):
+    def words_of(given: StrPath | None, own: str, read: Callable[[Path], tuple[Any, str]]) -> Any:
+        """The words of a given file, which must fit; else of the capture's own, which are left out if they do not."""
+        if given is None and (capture is None or not (Path(capture) / own).is_file()):
             return None
-        file = Path(capture or "", own) if asked is None else Path(asked)
+        file = Path(capture or "", own) if given is None else Path(given)
         words, name = read(file)
-        of_words = FeatureSpace(name, words.vectors.shape[1])
-        if asked is not None:
-            space.require(of_words, f"words of {file}")
-        elif name != space.name or not space.accepts(of_words):
-            reason = f"{own} is of {of_words}, the masks are of {space}: encode the words with the masks' model"
+        word_space = FeatureSpace(name, words.vectors.shape[1])
+        if given is not None:
+            space.require(word_space, f"words of {file}")
+        elif name != space.name or not space.accepts(word_space):
+            reason = f"{own} is of {word_space}, the masks are of {space}: encode the words with the masks' model"
             left_out.append(left_out_entry(CAPTURE_WORDS[own], reason=reason))
             return None
         return words
@@ -85,17 +85,17 @@ def scene_words(
 
 
 def bank_of_encoder(space: FeatureSpace, folder: StrPath | None = None) -> WordBank | None:
-    """The word bank of a text encoder's folder, or of the encoder that is found for the space; None where that has none
-    or is of another space."""
+    """The word bank of a text encoder's folder, or of the encoder found for the space; None if it has none or is of
+    another space."""
     encoder = find_encoder(space.name) if folder is None else read_text_encoder(folder)
     return encoder.word_bank if encoder is not None and encoder.feature_space == space.name else None
 
 
 def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrPath | None = None) -> Vocabulary:
-    """Store words with their vectors in a .ogpc file, after those that it has; a word that it has gets the new vector.
-    Returns all that it has now.
+    """Append words with their vectors to those of a .ogpc file; a word that it already has gets the new vector. Returns
+    all its words.
 
-    feature_space: of the vectors. output: another file to write; None: the same one, replaced whole or not at all.
+    feature_space: of the vectors. output: another file to write; None: the same one, replaced atomically.
     FeatureSpaceError for vectors of another space or width than the file's.
     """
     bundle = read_bundle(path)
@@ -103,18 +103,18 @@ def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrP
     added = FeatureSpace(feature_space, words.vectors.shape[1])
     cloud.space.require(added, "words")
     old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
-    if old.names:  # where no instance has a descriptor, they alone say how wide the space is
+    if old.names:  # if no instance has a descriptor, they alone tell the width of the space
         FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
-    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))  # of a word in both, the later vector stays
+    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))  # for a word in both, the later vector stays
     vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
-    together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
-    counts = {**bundle.manifest["counts"], "words": len(together.names)}
-    _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(together))
-    return together
+    merged = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
+    counts = {**bundle.manifest["counts"], "words": len(merged.names)}
+    _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(merged))
+    return merged
 
 
 def read_bank(path: StrPath) -> tuple[WordBank, str]:
-    """A text-features file as a bank, and its feature space; FeatureSpaceError where its words are too few."""
+    """A text-features file as a bank, and its feature space; FeatureSpaceError if it has too few words."""
     vocabulary, feature_space = read_text_features(path)
     try:
         return WordBank(vocabulary.vectors), feature_space
@@ -123,7 +123,7 @@ def read_bank(path: StrPath) -> tuple[WordBank, str]:
 
 
 def store_bank(path: StrPath, bank: WordBank, feature_space: str, output: StrPath | None = None) -> None:
-    """Store a word bank in a .ogpc file, in place of one that it has; its answers are then calibrated.
+    """Store a word bank in a .ogpc file, in place of any that it has; its answers are then calibrated.
 
     feature_space, output, errors: as for ``add_words``.
     """
@@ -133,9 +133,9 @@ def store_bank(path: StrPath, bank: WordBank, feature_space: str, output: StrPat
 
 
 def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None) -> TextEncoder:
-    """Store a text encoder in a .ogpc file, which then answers any word wherever it goes. Returns the encoder.
+    """Store a text encoder in a .ogpc file, which can then answer any word on any machine. Returns the encoder.
 
-    folder: what ``og-pointcloud export text`` wrote; a file without a word bank gets the encoder's. output: as for
+    folder: written by ``og-pointcloud export text``; a file without a word bank gets the encoder's. output: as for
     ``add_words``.
     """
     bundle = read_bundle(path)
@@ -147,10 +147,10 @@ def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None)
 
 
 def carried_encoder(path: StrPath | None) -> CarriedEncoder:
-    """A function that opens the text encoder in a .ogpc file, when it is first needed: for most questions it never is.
+    """A function that opens the text encoder in a .ogpc file when it is first needed, which it rarely is.
 
-    It returns None where the file carries no encoder or is no longer there, and the same encoder again for an unchanged
-    file. OgPointcloudError where the encoder cannot be used.
+    It returns None if the file carries no encoder or no longer exists, and the same encoder again for an unchanged
+    file. OgPointcloudError if the encoder cannot be used.
     """
 
     def opened() -> TextEncoder | None:
@@ -176,7 +176,7 @@ def encoder_members(folder: StrPath, space: FeatureSpace) -> tuple[dict[str, byt
 
 
 def vocabulary_members(vocabulary: Vocabulary) -> dict[str, bytes]:
-    """The members that hold words: names, and unit vectors in float32. OgPointcloudError for what no reader takes."""
+    """The members that hold words: names, and float32 unit vectors. OgPointcloudError for words that readers refuse."""
     check_names(vocabulary.names)
     checked_vocabulary(vocabulary.names, vocabulary.vectors)
     names = json.dumps(list(vocabulary.names), ensure_ascii=False).encode()
@@ -187,16 +187,16 @@ def vocabulary_members(vocabulary: Vocabulary) -> dict[str, bytes]:
 
 
 def bank_members(bank: WordBank) -> dict[str, bytes]:
-    """The member that holds a word bank. In float16: a statistic of many words does not feel a word's last digits."""
+    """The member that holds a word bank. float16 suffices: a statistic of many words ignores a word's last digits."""
     return {BANK: npy_bytes(bank.vectors.astype(np.float16))}
 
 
 def _rewrite(path: StrPath, output: StrPath | None, manifest: Mapping[str, Any], changes: Mapping[str, bytes]) -> None:
-    """A bundle with some members replaced or added, and this manifest; the others are copied as they are."""
-    # The manifest names all members: of those that change, bytes and checksums; the others' stay true.
+    """Write a bundle with some members replaced or added, and this manifest; the others are copied."""
+    # The manifest's entries of changed members are made anew; the others stay valid.
     members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}
     text = manifest_json({**manifest, "members": members})
     with zipfile.ZipFile(path) as source, replacing(output or path) as file, zipfile.ZipFile(file, "w") as target:
-        target.writestr(zipfile.ZipInfo("manifest.json"), text)  # by ZipInfo, dated 1980: equal contents, equal bytes
+        target.writestr(zipfile.ZipInfo("manifest.json"), text)  # ZipInfo is dated 1980: equal contents, equal bytes
         for name in members:
             target.writestr(zipfile.ZipInfo(name), changes[name] if name in changes else source.read(name))

@@ -1,1 +1,1 @@
-"""Answers made visible: a page, pictures of what a fit saw and made, edited splats."""
+"""Visualization: pages, pictures of a fit's input and result, edited splats."""

@@ -1,4 +1,4 @@
-"""Two visits in one: what is gone, new and moved, for a page that switches each on and off, and for the live page."""
+"""Two visits in one cloud: what is gone, new and moved, for a page with a switch for each, and for the live page."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from og_pointcloud.show.live import CHANGES
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import choose_viewpoint
 
-STATES = tuple(CHANGES)[:4]
-"""Labels of the page: gone, new, and from where to where things moved; what has none of them is as it was, or was not
-seen again."""
+CHANGE_LABELS = tuple(CHANGES)[:4]
+"""Labels of the page: gone, new, moved from and moved to; instances without one are unchanged or not seen again."""
 
 
 def both_visits(
     before: LabelledCloud, after: LabelledCloud, changes: Changes
 ) -> tuple[LabelledCloud, NDArray[np.intp]]:
-    """The later visit, and of the earlier one what left its place; and (K,) what became of each instance, a row of
+    """The later visit, plus what left its place since the earlier one; and (K,) the change of each instance, a row of
     `live.CHANGES`.
 
-    Instances of the later visit keep their ids; those of the earlier one follow behind.
+    Instances of the later visit keep their ids; those of the earlier one follow.
     """
     gone, moved = [*changes.gone], [entry.id for entry in changes.moved]
     rows = np.flatnonzero(np.isin(before.instance_ids, gone + moved))
@@ -39,7 +38,7 @@ def both_visits(
     change[[entry.now for entry in changes.moved]] = names.index("moved to here")
     change[count + np.array(gone, np.intp)] = names.index("gone")
     change[count + np.array(moved, np.intp)] = names.index("moved from here")
-    shift = before.origin - after.origin  # each visit has a local frame of its own
+    shift = before.origin - after.origin  # each visit has its own local frame
     colored = before.rgb is not None and after.rgb is not None
     ids = np.concatenate([after.instance_ids, before.instance_ids[rows] + count]).astype(np.int32)
     both = replace(
@@ -56,18 +55,18 @@ def both_visits(
 def write_changes_page(
     path: StrPath, before: LabelledCloud, after: LabelledCloud, changes: Changes, up: NDArray[np.float64]
 ) -> None:
-    """Write the page, whole or not at all. up: (3,) unit."""
+    """Write the page atomically. up: (3,) unit vector."""
     both, change = both_visits(before, after, changes)
     scene = LabelledScene.from_cloud(both)
-    # The page shows changes as if they were labels; what is as it was has none.
-    labels = np.append(change, [-1, -1])[both.instance_ids].astype(np.int32)  # states -2 and -1 index the last two
-    labels[labels >= len(STATES)] = -1
+    # The page shows changes as labels; unchanged instances have none.
+    labels = np.append(change, [-1, -1])[both.instance_ids].astype(np.int32)  # ids -2 and -1 index the last two
+    labels[labels >= len(CHANGE_LABELS)] = -1
     reasons = np.where(labels < 0, Reason.NONE_FITS, Reason.LABELLED).astype(np.int8)
     result = Segmentation(
-        scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, STATES, scene.path
+        scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, CHANGE_LABELS, scene.path
     )
     view = choose_viewpoint(scene.xyz, labels >= 0, up)
-    colors = tuple(CHANGES[name] for name in STATES)
+    colors = tuple(CHANGES[name] for name in CHANGE_LABELS)
     look = Look(
         f"What changed: {changes}", boxes=True, cut=0.2, colors=colors, unlabelled="as it was, or not seen again"
     )

@@ -1,16 +1,16 @@
-"""Scene editing (A.2.1): objects taken out, kept alone, recolored, or put into a cloud or 3DGS file.
+"""Scene editing (A.2.1): remove, extract or recolor objects of a cloud or 3DGS file, or insert another one.
 
     og.edit.remove(scene, "red mug", "without.ply", cloud="kitchen.ply")
     og.edit.recolor(scene, "chair", "blue.ply", (40, 70, 220), cloud="kitchen.ply")
     og.edit.extract(scene, og.pick(scene, (1.2, 0.4, 0.8)), "mug.ply", cloud="kitchen.ply")
     og.edit.insert("kitchen.ply", "mug.ply", "two_mugs.ply", pose)
 
-Results are PLY files of the layout that the cloud had, which any viewer opens, or of splats SPZ. In a PLY, points that
-an edit does not concern keep every property and value they had: spherical harmonics, normals, whatever a trainer added.
-Originals stay.
+Results are PLY files in the cloud's layout, which any viewer opens, or SPZ for splats. In a PLY, points that the edit
+does not affect keep every property and value: spherical harmonics, normals, whatever a trainer added. The original
+files are not changed.
 
-Which points an object has is decided by the .ogpc file. Where the cloud is the one it was made from, row i has the id
-of the scene's point i; else each point of the cloud takes the id of the scene's nearest point within its reach.
+The .ogpc file decides which points belong to an object. If the cloud is the one it was made from, row i has the id of
+the scene's point i; else each point of the cloud takes the id of the nearest scene point within reach.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 What: TypeAlias = "str | SupportsIndex | Iterable[SupportsIndex] | Pick | Match | Selection"
-"""What to edit: a text, for the instances that it fits (`select`); ids of instances; what a click or `select` gave."""
+"""What to edit: a text, for the instances that it fits (`select`); instance ids; the result of `pick` or `select`."""
 
 Rows = NDArray[np.void]
 
-SAME_PLACE = 1e-3
-"""Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
-RIGID = 1e-4
-"""How far a pose may be off a rotation times one scale, in any entry of R R' - 1."""
+SAME_POINT_SPACINGS = 1e-3
+"""Distance, in spacings, up to which a point of the cloud equals the scene's: .ogpc files store float32."""
+ROTATION_TOLERANCE = 1e-4
+"""Largest deviation of a pose from a rotation times one scale, in any entry of R R' - 1."""
 
 
 class EditOptions(TypedDict, total=False):
     """cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colors.
-    halo: points of no instance that lie this near to the object, in spacings, go with it: what surrounds an object in
-        a 3DGS file often has no label; default 0. text_features: as for ``segment``.
+    halo: distance in spacings, default 0: points of no instance this close to the object are edited with it, since what
+        surrounds an object in a 3DGS file often has no label. text_features: as for ``segment``.
     """
 
     cloud: StrPath | None
@@ -67,8 +67,8 @@ class EditOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Edit:
-    """What an edit wrote. path: the file. points: how many it has. changed: how many were removed, extracted,
-    recolored or inserted. instances: ids of the scene's instances concerned. notes: what could not be kept."""
+    """Result of an edit. path: the file written. points: its number of points. changed: number of points removed,
+    extracted, recolored or inserted. instances: ids of the edited instances. notes: what could not be kept."""
 
     path: Path
     points: int
@@ -80,11 +80,11 @@ class Edit:
 def remove(scene: SceneLike, what: What, output: StrPath, **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud without some instances.
 
-    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, of splats
-    or .spz, not an input.
+    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, or for splats
+    a .spz; not an input file.
     options: see `EditOptions`.
-    Raises OgPointcloudError where no instance is meant or none of the cloud's points belongs to it, SceneError for
-    a cloud that cannot be read.
+    Raises OgPointcloudError if ``what`` gives no instance or no point of the cloud belongs to it, SceneError for a
+    cloud that cannot be read.
     """
     subject = _subject(scene, what, output, **options)
     if subject.chosen.all():
@@ -93,7 +93,7 @@ def remove(scene: SceneLike, what: What, output: StrPath, **options: Unpack[Edit
 
 
 def extract(scene: SceneLike, what: What, output: StrPath, **options: Unpack[EditOptions]) -> Edit:
-    """Write some instances alone. Arguments and errors as for `remove`."""
+    """Write only some instances. Arguments and errors as for `remove`."""
     subject = _subject(scene, what, output, **options)
     return subject.write(output, subject.rows[subject.chosen], "extracted")
 
@@ -101,8 +101,8 @@ def extract(scene: SceneLike, what: What, output: StrPath, **options: Unpack[Edi
 def recolor(scene: SceneLike, what: What, output: StrPath, color: ArrayLike, **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud with some instances in another color.
 
-    color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the color, and Gaussians also
-    how theirs changes with direction. Other arguments and errors as for `remove`.
+    color: (3,) RGB, 0 to 255; becomes the object's mean color. The object keeps its shading, and Gaussians also their
+    view dependence. Other arguments and errors as for `remove`.
     """
     rgb = numbers_of(color)
     if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not ((rgb >= 0) & (rgb <= 255)).all():
@@ -117,12 +117,12 @@ def insert(
     cloud: StrPath, other: StrPath, output: StrPath,
     pose: ArrayLike | None = None,
 ) -> Edit:  # fmt: skip
-    """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
+    """Write a cloud with another one inserted, both plain clouds or both 3DGS files.
 
-    pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
-    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
-    harmonics, exactly, up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
-    points, and positions become float64 where float32 would move points by more than 1e-6 of the extent.
+    pose: (4, 4), maps the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
+    Left out: they share a frame. It is applied to positions, normals, rotations and scales of Gaussians, and exactly to
+    spherical harmonics up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
+    points, and positions become float64 if float32 would move points by more than 1e-6 of the extent.
     SceneError for a pose that shears or mirrors, and for clouds of different kinds or that cannot be read.
     """
     rotation, scale, translation = _similarity(pose)
@@ -142,9 +142,9 @@ def insert(
 
 @dataclass(frozen=True)
 class _Cloud:
-    """A file as its elements, rows of ``vertex`` in the layout that is written, and what an edit concerns.
+    """The elements of a file, with rows of ``vertex`` in the layout to write, and the points to edit.
 
-    notes: what could not be kept. chosen: (n,) bool, the rows concerned. instances: to whom they belong.
+    notes: what could not be kept. chosen: (n,) bool, the rows to edit. instances: the instances that they belong to.
     """
 
     elements: Mapping[str, Rows]
@@ -157,7 +157,7 @@ class _Cloud:
         return self.elements["vertex"]
 
     def write(self, output: StrPath, rows: Rows, verb: str) -> Edit:
-        """Write other rows in place of the cloud's."""
+        """Write the cloud with other rows."""
         changed, elements, notes = int(self.chosen.sum()), {**self.elements, "vertex": rows}, self.notes
         if Path(output).suffix == ".spz":
             notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
@@ -173,7 +173,7 @@ def _subject(
     scene: SceneLike, what: What, output: StrPath, cloud: StrPath | None = None,
     halo: float = 0.0, text_features: TextFeatures = None,
 ) -> _Cloud:  # fmt: skip
-    """Reads the cloud and finds the points that are meant."""
+    """Read the cloud and find the points to edit."""
     if not (isinstance(halo, Real) and 0 <= halo < np.inf):
         raise OgPointcloudError(f"halo is {halo}; expected a number of spacings, at least 0")
     scene = as_scene(scene)
@@ -195,13 +195,13 @@ def _subject(
 
 def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatures) -> tuple[int, ...]:
     count = len(scene.cloud.instances)
-    of = what.scene if isinstance(what, (Pick, Selection)) else what._scene if isinstance(what, Match) else scene
-    if not _is_same(of, scene):
+    origin = what.scene if isinstance(what, (Pick, Selection)) else what._scene if isinstance(what, Match) else scene
+    if not _is_same(origin, scene):
         raise OgPointcloudError(
-            f"the {type(what).__name__} to edit is of {of!r:.80}, the scene is {scene!r:.80}; expected one of this "
+            f"the {type(what).__name__} to edit is of {origin!r:.80}, the scene is {scene!r:.80}; expected one of this "
             "scene: they are of two scenes"
         )
-    # Step by step from what is meant to ids: a text becomes a selection, that its instances, a single one its id.
+    # Converted to ids step by step: a text to a selection, a selection to its instances, a match or pick to its id.
     if isinstance(what, str):
         what = select(scene, what, text_features=text_features)
     if isinstance(what, Selection) and not what.fitting:
@@ -223,15 +223,15 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
 
 
 def _is_same(one: LabelledScene, other: LabelledScene) -> bool:
-    """Whether ids of one mean the same points in the other: a file may be opened twice, or sent to a process."""
+    """Whether ids mean the same points in both scenes: a file may be opened twice, or sent to another process."""
     return one is other or (
         np.array_equal(one.cloud.xyz, other.cloud.xyz) and np.array_equal(one.instance_ids, other.instance_ids)
     )
 
 
 def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None) -> tuple[IntArray, tuple[str, ...]]:
-    """Instance id of each point of the cloud: the scene's own where it is the same cloud, else the nearest point's."""
-    if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_PLACE * scene.cloud.spacing).all():
+    """Instance id of each point of the cloud: the scene's if it is the same cloud, else the nearest point's; notes."""
+    if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_POINT_SPACINGS * scene.cloud.spacing).all():
         return scene.instance_ids, ()
     ids = scene.instances_at(xyz)
     far = int((ids == TOO_FAR).sum())
@@ -251,12 +251,12 @@ def _halo(
 ) -> NDArray[np.bool_]:
     """(n,) bool, points of no instance that lie within ``halo`` spacings of a chosen one."""
     local = (xyz - scene.cloud.origin).astype(np.float32)
-    loose = np.flatnonzero((ids < 0) & np.isfinite(local).all(axis=1))
+    unassigned = np.flatnonzero((ids < 0) & np.isfinite(local).all(axis=1))
     spacing = scene.cloud.spacing
-    nearest = NearestPoint(local[chosen], spacing, halo * spacing).query(local[loose])
-    near = np.zeros(len(xyz), bool)
-    near[loose[nearest >= 0]] = True
-    return near
+    nearest = NearestPoint(local[chosen], spacing, halo * spacing).query(local[unassigned])
+    in_halo = np.zeros(len(xyz), bool)
+    in_halo[unassigned[nearest >= 0]] = True
+    return in_halo
 
 
 def _check_output(output: StrPath, inputs: Iterable[StrPath]) -> None:
@@ -274,8 +274,8 @@ def _check_output(output: StrPath, inputs: Iterable[StrPath]) -> None:
 
 
 def _read(path: Path) -> _Cloud:
-    """A cloud's elements: those of a PLY as they are, anything else as a PLY would hold it."""
-    # The header alone tells a PLY, and whether it has lists, which are not read.
+    """A cloud's elements: those of a PLY as they are, other formats converted to PLY's."""
+    # The header alone identifies a PLY, and tells whether it has lists, which are not read.
     with naming(path), path.open("rb") as file:
         head = file.read(HEADER_LIMIT).partition(b"end_header")[0]
     if not head.startswith(b"ply"):
@@ -304,7 +304,7 @@ def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = np.cbrt(determinant)  # det(s R) = s^3
     rotation = matrix[:3, :3] / (scale if scale > 0 else 1)
-    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
+    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise SceneError(
             f"pose has a determinant of {determinant:.4g} and shears or mirrors; expected a rotation times one "
             "positive scale: Gaussians cannot follow any other"

@@ -1,4 +1,4 @@
-"""What was found, as a page with a picture of each: drawn from the points of its scene, where that is still there."""
+"""Findings of a search as a page with a picture of each, drawn from its scene's points if the file still exists."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.show.viewpoint import Viewpoint
 
 SIDE_PX = 200
-AROUND = 0.35
-"""How much of a thing's largest length is shown around it."""
-MOST_POINTS = 60_000
+MARGIN_SHARE = 0.35
+"""Margin shown around an instance, as a share of its largest length."""
+MAX_POINTS = 60_000
 """Points that a picture is drawn from."""
-EYE, UP = np.array([1.0, -1.4, 1.1]), np.array([0.0, 0.0, 1.0])
-"""Where the eye is, as seen from the thing; z is up, as `og-pointcloud view` has it unless told."""
-FAR = 20.0
-"""How far away it is, in widths of the picture: hardly any perspective."""
-PAPER = 250
-FADED = 0.6
-"""How far what is around a thing fades into the paper."""
+EYE_DIRECTION, UP_DIRECTION = np.array([1.0, -1.4, 1.1]), np.array([0.0, 0.0, 1.0])
+"""Direction from the instance to the eye; z is up, the default of `og-pointcloud view`."""
+EYE_DISTANCE_WIDTHS = 20.0
+"""Distance of the eye, in widths of the picture: hardly any perspective."""
+BACKGROUND_GRAY = 250
+FADE_SHARE = 0.6
+"""Share of the background mixed into the points around the instance."""
 HIGHLIGHT = (214, 90, 40)
-"""Color of things in clouds without colors."""
+"""Color of the instance in clouds without colors."""
 
 PAGE = """<!doctype html><html><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 2em; color: #222; background: #fff }}
@@ -47,7 +47,7 @@ b {{ font-size: 15px }} .score {{ float: right }} .misfit {{ opacity: 0.4 }}
 
 
 def write_findings(path: StrPath, collection: Collection, findings: Findings, title: str) -> None:
-    """Write the page, whole or not at all. title: what was asked."""
+    """Write the page atomically. title: the query."""
     text = PAGE.format(
         title=html.escape(title),
         notes="<br>".join(map(html.escape, [_fitting(findings), *findings.not_asked])),
@@ -65,7 +65,7 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
         cloud = as_scene(collection.file(finding.scene)).cloud
         png = base64.b64encode(picture(cloud, finding)).decode()
         shown = f'<img alt="instance {finding.instance}" src="data:image/png;base64,{png}">'
-    except (OgPointcloudError, OSError):  # moved, or written anew: what was found then is still true of it then
+    except (OgPointcloudError, OSError):  # moved or rewritten since: the finding itself stays valid for that time
         shown = '<div class="none">file not found</div>'
     center, size = ", ".join(map(coordinate, finding.center)), ", ".join(f"{value:.3g}" for value in finding.size)
     kind = "" if finding.fits else " class=misfit"
@@ -77,29 +77,33 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
 
 
 def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
-    """A square PNG of an instance and what is around it, seen from far above and aside."""
+    """A square PNG of an instance and its surroundings, seen obliquely from far above."""
     half = np.array(finding.size) / 2
-    reach = half + AROUND * max(2 * half.max(), 8 * cloud.spacing)
-    # The thing's middle is the picture's origin.
+    reach = half + MARGIN_SHARE * max(2 * half.max(), 8 * cloud.spacing)
+    # The instance's center is the picture's origin.
     local = cloud.xyz - (np.array(finding.center) - cloud.origin).astype(np.float32)
-    near = np.flatnonzero((np.abs(local) <= reach).all(axis=1))
-    near = near[:: 1 + len(near) // MOST_POINTS]
-    is_it = cloud.instance_ids[near] == finding.instance
+    rows = np.flatnonzero((np.abs(local) <= reach).all(axis=1))
+    rows = rows[:: 1 + len(rows) // MAX_POINTS]
+    in_instance = cloud.instance_ids[rows] == finding.instance
     if cloud.rgb is None:
-        colors = np.where(is_it[:, None], HIGHLIGHT, 150).astype(float)
+        colors = np.where(in_instance[:, None], HIGHLIGHT, 150).astype(float)
     else:
-        colors = cloud.rgb[near].astype(float)
-    colors[~is_it] += FADED * (PAPER - colors[~is_it])
+        colors = cloud.rgb[rows].astype(float)
+    colors[~in_instance] += FADE_SHARE * (BACKGROUND_GRAY - colors[~in_instance])
     shown = replace(
-        cloud, xyz=local[near], origin=np.zeros(3), instance_ids=cloud.instance_ids[near], rgb=None, certainty=None
+        cloud, xyz=local[rows], origin=np.zeros(3), instance_ids=cloud.instance_ids[rows], rgb=None, certainty=None
     )
-    eye = FAR * 2 * np.linalg.norm(reach) * EYE / np.linalg.norm(EYE)
-    front = front_points(shown, Viewpoint(eye, np.zeros(3), UP).camera(SIDE_PX, SIDE_PX, FAR * SIDE_PX))
-    return png_bytes(np.append(colors, [[PAPER] * 3], axis=0).astype(np.uint8)[front])  # -1, no point, is the last
+    eye = EYE_DISTANCE_WIDTHS * 2 * np.linalg.norm(reach) * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
+    front = front_points(
+        shown, Viewpoint(eye, np.zeros(3), UP_DIRECTION).camera(SIDE_PX, SIDE_PX, EYE_DISTANCE_WIDTHS * SIDE_PX)
+    )
+    return png_bytes(
+        np.append(colors, [[BACKGROUND_GRAY] * 3], axis=0).astype(np.uint8)[front]
+    )  # -1, no point, is the last
 
 
 def png_bytes(image: NDArray[np.uint8]) -> bytes:
-    """An image (H, W, 3) as PNG: numpy and zlib are all that is needed."""
+    """An image (H, W, 3) as PNG, with numpy and zlib alone."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,4 +1,4 @@
-"""The losses of a fit in mode paper, as a picture."""
+"""Picture of the losses of a fit in mode paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.images import require_cv2, write_png
 
 WIDTH, HEIGHT, STRIP, MARGIN = 360, 200, 26, 10
-"""Pixels: of a plot, of the strips of text above and below it, and beside its curve."""
+"""Pixels of a plot, of the text strips above and below it, and of the margin beside its curve."""
 CURVE = (31, 119, 180)
 
 
@@ -24,7 +24,7 @@ def training_picture(stages: Sequence[Mapping[str, Any]], path: StrPath) -> Path
     cv2 = require_cv2()
     panels = []
     for stage in stages:
-        loss = np.repeat(stage["loss"], 2 if len(stage["loss"]) == 1 else 1)  # one alone is a level line
+        loss = np.repeat(stage["loss"], 2 if len(stage["loss"]) == 1 else 1)  # a single value becomes a level line
         panel = np.full((HEIGHT + 2 * STRIP, WIDTH, 3), 255, np.uint8)
         top = float(loss.max(initial=0.0)) or 1.0
         points = np.stack([np.linspace(MARGIN, WIDTH - MARGIN, len(loss)), STRIP + HEIGHT * (1 - loss / top)], axis=1)

@@ -1,6 +1,6 @@
-"""What a live page shows of a scene and what it answers, without the page: colors of points, words, clicks, instances.
+"""State and answers of a live page, without the page: colors of points, words, clicks, instances.
 
-``serve`` puts this into a browser. State is small: how points are colored, and which instances are lit.
+``serve`` shows it in a browser. The state is small: the color mode, and which instances are highlighted ("lit").
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, 
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
 from og_pointcloud.show.viewpoint import Viewpoint
-from og_pointcloud.text.words import LONGEST_WORD, Labels, TextFeatures
+from og_pointcloud.text.words import MAX_WORD_CHARACTERS, Labels, TextFeatures
 
-MODES = ("labels", "instances", "certainty", "changes", "photo")
+COLOR_MODES = ("labels", "instances", "certainty", "changes", "photo")
 CHANGES = {
     "gone": (200, 30, 60), "new": (24, 150, 70), "moved from here": (244, 178, 60), "moved to here": (226, 88, 34),
     "not seen at the last visit": (86, 110, 190), "as it was": NO_LABEL,
 }  # fmt: skip
-"""What became of an instance between two visits, and its color. A map of several has no points of what left."""
-WORDS = 6
-"""Words that are shown of an instance."""
-MATCHES = 12
-"""Instances that are listed for a word."""
-HINTED = 8
-"""Stored words that are named as examples."""
-DARKEST, LIGHTEST = 0.55, 1.10
-"""Factors of a label's color where the point's own is black and where it is white: shapes and shadows stay visible."""
-FADED = (0.72, 237)
-"""What is not lit becomes its own grey, mixed with this share of this light grey."""
+"""Changes of an instance between two visits, and their colors. A map of several visits has no points of what left."""
+MAX_WORDS_SHOWN = 6
+"""Words shown for an instance."""
+MAX_MATCHES_SHOWN = 12
+"""Instances listed for a word."""
+MAX_HINT_WORDS = 8
+"""Stored words given as examples."""
+MIN_SHADE, MAX_SHADE = 0.55, 1.10
+"""Factors of a label's color if the point's own is black, and if it is white: shapes and shadows stay visible."""
+FADE_SHARE, FADE_GREY = 0.72, 237
+"""Points that are not lit turn grey, mixed with this share of this light grey."""
 CLICK_PX = 33
-"""Side of the square around a click in which points are looked for."""
+"""Side of the square around a click in which points are searched."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A text for the page: title, lines, words or instances with their scores, and what the scores mean."""
+    """An answer for the page. bars: words or instances with their scores. note: what the scores mean."""
 
     title: str
     lines: tuple[str, ...] = ()
@@ -55,11 +55,12 @@ class Answer:
 
 
 class LiveScene:
-    """A scene on show, its points or those of another cloud of the place.
+    """A scene to show, by its own points or by another cloud of the same place.
 
-    scene: what is asked. shown: the points to show, Gaussians perhaps; None for the scene's own. labels, text_features:
-    the words of mode "labels", as for ``segment``; left out, the scene's own, or none. changes: (K,) what became of
-    each instance, a row of `CHANGES`, which is then shown first; None for what a map of several visits knows.
+    scene: the scene to query. shown: the points to show, possibly Gaussians; None for the scene's own. labels,
+    text_features: the words of mode "labels", as for ``segment``; left out, the scene's own, or none. changes: (K,) the
+    change of each instance, a row of `CHANGES`, in which case this mode comes first; None for those that a map of
+    several visits records.
 
     >>> live = LiveScene(og.LabelledScene.from_cloud(cloud))  # of `LabelledCloud`'s example
     >>> live.ask("desk").lines, live.lit
@@ -78,29 +79,29 @@ class LiveScene:
         self.xyz = scene.xyz if shown is None else shown.xyz_world
         self.rgb = scene.cloud.rgb if shown is None else shown.rgb
         self.ids = scene.instance_ids if shown is None else scene.instances_at(self.xyz)
-        """(N,) instance of each point shown; ids below 0 index tables by id from their end."""
+        """(N,) instance of each point shown; negative ids index tables by id from their end."""
         words = scene.known_words(labels, text_features)
         self.names = words.names
         self.label_of = scene.chooser.choose(words.vectors).by_id[0]
         known = _known_changes(scene.cloud) if changes is None else changes
-        # Ids below 0 read the table's end: "as it was", the last of CHANGES.
-        others = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)
-        self._change_of = None if known is None else np.concatenate([known, others])
+        # Negative ids read the table's end: "as it was", the last of CHANGES.
+        unchanged = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)
+        self._change_of = None if known is None else np.concatenate([known, unchanged])
         has = {
             "labels": self.names,
             "changes": self._change_of is not None,
             "certainty": scene.certainty is not None,
             "photo": self.rgb is not None,
         }
-        self.modes = tuple(mode for mode in MODES if has.get(mode, True))
+        self.modes = tuple(mode for mode in COLOR_MODES if has.get(mode, True))
         self.mode = self.modes[0] if changes is None else "changes"
         self.lit: set[int] | None = None
-        """Ids of the instances that stand out, None where all do."""
+        """Ids of the highlighted instances, None if all are."""
 
     # What is shown --------------------------------------------------------------------------------------------------
 
     def colors(self) -> NDArray[np.uint8]:
-        """(N, 3) uint8 RGB of the points shown: as the mode has it, in grey what is not lit."""
+        """(N, 3) uint8 RGB of the points shown, by mode; grey for points that are not lit."""
         if self.mode == "photo":
             base = self._photo
         elif self.mode == "certainty":
@@ -109,19 +110,18 @@ class LiveScene:
             base = self._painted()
         if self.lit is None:
             return base
-        share, grey = FADED
-        total = base[:, 0] + base[:, 1].astype(np.uint16) + base[:, 2]  # three bytes do not fit into one
-        faded = (np.float32(share * grey) + np.float32((1 - share) / 3) * total).astype(np.uint8)
+        total = base[:, 0] + base[:, 1].astype(np.uint16) + base[:, 2]  # the sum of three uint8 would overflow
+        faded = (np.float32(FADE_SHARE * FADE_GREY) + np.float32((1 - FADE_SHARE) / 3) * total).astype(np.uint8)
         return np.where(self._is_lit[self.ids][:, None], base, faded[:, None])
 
     @cached_property
     def instances(self) -> Instances:
         """The instances as a table, each with its best words."""
-        return instance_table(self.scene, text_features=self._text_features, words=WORDS)
+        return instance_table(self.scene, text_features=self._text_features, words=MAX_WORDS_SHOWN)
 
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
-        """(name, RGB, points), the most frequent first and what has no label last; colors are gray where the mode does
-        not show labels."""
+        """(name, RGB, points), the most frequent first and unlabelled points last; colors are gray if the mode does not
+        show labels."""
         if self.mode == "changes" and self._change_of is not None:
             points = np.bincount(self._change_of[self.ids], minlength=len(CHANGES)).tolist()
             return [(name, color, count) for (name, color), count in zip(CHANGES.items(), points, strict=True) if count]
@@ -139,13 +139,13 @@ class LiveScene:
         return f"{words[0][0]}?" if words else f"instance {instance}"
 
     def _painted(self) -> NDArray[np.uint8]:
-        """Colors of labels or instances, lighter and darker as the points' own are."""
+        """Colors of labels, changes or instances, shaded by the brightness of the points' own colors."""
         count = len(self.scene.cloud.instances)
         table = np.full((len(self.label_of), 3), NO_LABEL, np.uint8)
         own = label_colors(np.arange(count))
         labelled = self.label_of[:count] >= 0
         if self.mode == "labels":
-            # What was asked for should stand out, also where none of the labels fits it.
+            # Lit instances should stand out even if none of the labels fits them.
             show_own = ~labelled & self._is_lit[:count] if self.lit is not None else np.zeros(count, bool)
             table[:count] = np.where(labelled[:, None], label_colors(self.label_of[:count]), table[:count])
             table[:count][show_own] = own[show_own]
@@ -173,32 +173,32 @@ class LiveScene:
     @cached_property
     def _shade(self) -> NDArray[np.float32]:
         light = (self._photo / 255) @ LUMINANCE
-        return (DARKEST + (LIGHTEST - DARKEST) * light).astype(np.float32)[:, None]
+        return (MIN_SHADE + (MAX_SHADE - MIN_SHADE) * light).astype(np.float32)[:, None]
 
     # What is answered -----------------------------------------------------------------------------------------------
 
     def ask(self, text: str) -> Answer:
-        """Light the instances that a word fits; all for none, and for a word that is not known."""
+        """Light the instances that a word fits; all of them for an empty text or an unknown word."""
         word, self.lit = text.strip(), None
         if not word:
             own = self.scene.vocabulary.names if self.scene.vocabulary else ()
-            examples = ", ".join([*own[:HINTED], "..."] if len(own) > HINTED else own)
+            examples = ", ".join([*own[:MAX_HINT_WORDS], "..."] if len(own) > MAX_HINT_WORDS else own)
             stored = [f"stored words: {examples}"] if own else []
             return Answer("", (*stored, "click a thing to learn what it is"))
         try:
             selection = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
-            return Answer(f"“{printable(word, LONGEST_WORD)}”", (str(error),))
-        # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
+            return Answer(f"“{printable(word, MAX_WORD_CHARACTERS)}”", (str(error),))
+        # If nothing fits, the set is empty: all points are faded, and the closest instances are listed.
         self.lit = set(selection.instances)
-        of = counted(len(selection), "instance")
-        fits = f"fits {len(self.lit)} of {of}" if self.lit else "fits no instance; closest:"
-        shown = selection[: min(max(len(self.lit), 5), MATCHES)]
-        bars = tuple((self._beside(match), match.score) for match in shown)
+        total = counted(len(selection), "instance")
+        fits = f"fits {len(self.lit)} of {total}" if self.lit else "fits no instance; closest:"
+        shown = selection[: min(max(len(self.lit), 5), MAX_MATCHES_SHOWN)]
+        bars = tuple((self._match_text(match), match.score) for match in shown)
         return Answer(word, (fits,), bars, meaning(selection.calibrated))
 
     def choose(self, instance: int) -> Answer:
-        """Light one instance and tell what it is."""
+        """Light one instance and describe it."""
         row = self.instances[instance]
         self.lit = {instance}
         lines = [f"instance {instance} · {counted(row.points, 'point')} · {counted(row.views, 'view')}"]
@@ -213,30 +213,30 @@ class LiveScene:
         return Answer(title, tuple(lines), row.words, note)
 
     def click(self, eye: NDArray[np.float64], direction: NDArray[np.float64], focal_px: float) -> Answer:
-        """Light the instance that is seen from ``eye`` along a direction; tell what it is and how sure its point is.
+        """Light the instance seen from ``eye`` along a direction; describe it and give the certainty of its point.
 
-        eye, direction: (3,), world. focal_px: of the window that was clicked in.
+        eye, direction: (3,), world. focal_px: focal length of the window that was clicked in.
         """
-        # A small camera along the click; which way is up does not matter to its middle pixel.
+        # A small camera along the click; its up direction does not affect the middle pixel.
         view = Viewpoint(eye, eye + direction, np.eye(3)[np.abs(direction).argmin()])
         hit = pick(self.scene, view.camera(CLICK_PX, CLICK_PX, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
         if not hit.found:
             self.lit = None
             return Answer(str(hit), ("no instance",))
         answer = self.choose(hit.instance)
-        sure = self.scene.certainty
-        if sure is None or hit.point is None:
+        certainty = self.scene.certainty
+        if certainty is None or hit.point is None:
             return answer
-        line = f"that its point is part of it: {sure[hit.point]:.0%} sure"
+        line = f"that its point is part of it: {certainty[hit.point]:.0%} sure"
         return Answer(answer.title, (*answer.lines, line), answer.bars, answer.note)
 
-    def _beside(self, match: Match) -> str:
+    def _match_text(self, match: Match) -> str:
         rather = f" (rather {match.rival})" if not match.fits and match.rival else ""
         return f"instance {match.instance}{rather}"
 
 
 def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
-    """(K,) row of `CHANGES` of each instance of a map; None where there was one visit alone."""
+    """(K,) row of `CHANGES` of each instance of a map; None after fewer than two visits."""
     record = MapRecord.of(cloud)
     if len(record.visits) < 2:
         return None
@@ -251,5 +251,5 @@ def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
 
 
 def meaning(calibrated: bool) -> str:
-    """How the page explains its scores."""
+    """The page's explanation of its scores."""
     return "probability" if calibrated else "cosine: how similar, not how probable"

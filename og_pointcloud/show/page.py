@@ -1,6 +1,6 @@
-"""A scene as one HTML page that needs nothing else: turn it, ask it by clicks and words, switch labels on and off.
+"""A scene as one self-contained HTML page: rotate it, query it by clicks and words, switch labels on and off.
 
-page.html is the page; what it shows is put into it as JSON, arrays as deflated base64. Needs numpy alone.
+page.html is the template; the data is inserted as JSON, arrays as deflated base64. Needs numpy alone.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
-from og_pointcloud.show.live import WORDS, meaning
+from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
 
 TEMPLATE = Path(__file__).with_name("page.html")
-MOST_POINTS = 2_000_000
-"""Points that a page holds; of larger clouds an even choice, about 16 MB."""
-MOST_SCORES = 4_000_000
-"""Scores of words on instances that a page holds; beyond, it has no words to search for."""
-LEVELS = 65535
-"""Steps of 16-bit coordinates and scores: a place is off by at most half a step, 1/131,000 of the cloud's extent."""
+MAX_POINTS = 2_000_000
+"""Points of a page, about 16 MB; larger clouds are subsampled evenly."""
+MAX_SCORES = 4_000_000
+"""Scores of words on instances that a page holds; with more, it has no word search."""
+QUANTIZATION_STEPS = 65535
+"""Steps of 16-bit coordinates and scores: positions are off by at most half a step, 1/131,000 of the cloud's extent."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a page begins; a click changes all but the title.
+    """Initial state of a page; a click changes all but the title.
 
     mode: what colors show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
-    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number. unlabelled: what points without a
-    label are called.
+    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its index. unlabelled: name of points without a
+    label.
     """
 
     title: str
@@ -60,14 +60,14 @@ def write_page(
     look: Look,
     rgb: NDArray[np.uint8] | None = None,
 ) -> str:
-    """Write the page, whole or not at all; returns what it leaves out, in words, empty if nothing.
+    """Write the page atomically; returns what it leaves out, in words, empty if nothing.
 
     result: of ``scene``, at least one finite point. rgb: (N, 3) colors of its points.
     """
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:
         raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected points to show")
-    shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MOST_POINTS)).astype(np.int64)]
+    shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MAX_POINTS)).astype(np.int64)]
     left_out = [f"{len(result) - len(shown):,} of {len(result):,} points"] if len(shown) < len(result) else []
     words, word_data = _words(scene)
     if not words and scene.vocabulary and scene.vocabulary.names:
@@ -92,11 +92,11 @@ def write_page(
         "reasons": [str(Reason.TOO_FAR), str(Reason.UNOBSERVED), str(Reason.IN_NO_MASK)],  # of ids -3, -2, -1
         "instances": _instances(scene, result, view.up, middle, word_data.pop("choice")),
         "points": len(shown), "has_rgb": rgb is not None,
-        "place": _packed(_levels(xyz, low, high)), "instance": _packed(result.instances[shown].astype("<i4")),
+        "place": _packed(_quantized(xyz, low, high)), "instance": _packed(result.instances[shown].astype("<i4")),
         "rgb": _packed(np.full((len(shown), 3), 200, np.uint8) if rgb is None else np.asarray(rgb, np.uint8)[shown]),
         "words": words, **word_data,
     }  # fmt: skip
-    # Names come from files: no text of theirs may end the element that holds it.
+    # Names come from files: none may close the HTML element that contains it.
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     page = TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text)
     write_file(path, page.encode(errors="backslashreplace"))
@@ -104,15 +104,15 @@ def write_page(
 
 
 def _words(scene: LabelledScene) -> tuple[list[str], dict[str, Any]]:
-    """The scene's own words; their score on each instance, and which of them, if any, an instance is."""
+    """The scene's own words; their scores on each instance, and the word chosen for each instance, if any."""
     own, count = scene.vocabulary, len(scene.instances)
     nothing = {"choice": np.full(count, -1), "word_scores": "", "lowest": 0.0, "highest": 1.0}
-    if own is None or not own.names or count * len(own.names) > MOST_SCORES:
+    if own is None or not own.names or count * len(own.names) > MAX_SCORES:
         return [], nothing
     choice = scene.chooser.choose(own.vectors)
     scores = np.where(np.isfinite(choice.scores), choice.scores, 0).astype(np.float64)
     low, high = float(scores.min(initial=0)), float(scores.max(initial=1))
-    packed = _packed(_levels(scores, np.float64(low), np.float64(high)))
+    packed = _packed(_quantized(scores, np.float64(low), np.float64(high)))
     return list(own.names), {"choice": choice.labels, "word_scores": packed, "lowest": low, "highest": high}
 
 
@@ -123,11 +123,11 @@ def _instances(
     middle: NDArray[np.float64],
     choice: NDArray[np.integer],
 ) -> list[dict[str, Any]]:
-    # All points of an instance have one label: that of its first one.
+    # All points of an instance have the same label: that of its first point.
     present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
     shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []
-    for row in with_boxes(instance_table(scene, up=up, words=WORDS)):
+    for row in with_boxes(instance_table(scene, up=up, words=MAX_WORDS_SHOWN)):
         label, points = shown.get(row.id, (-1, 0))
         record: dict[str, Any] = {
             "id": row.id, "label": label, "points": points, "views": row.views, "words": row.words,
@@ -142,8 +142,8 @@ def _instances(
     return rows
 
 
-def _levels(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
-    return np.rint((values - low) / np.where(high > low, high - low, 1) * LEVELS).astype("<u2")
+def _quantized(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
+    return np.rint((values - low) / np.where(high > low, high - low, 1) * QUANTIZATION_STEPS).astype("<u2")
 
 
 def _packed(array: NDArray[Any]) -> str:

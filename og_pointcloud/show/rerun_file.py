@@ -1,7 +1,7 @@
 """Frames, masks and the instances that appear in them, as a .rrd file for the Rerun viewer. Needs the extra 'rerun'.
 
-A sink for streams (`RerunSink`), and what a fit saw and made, a view a step (`write_rerun`). Nothing is served and no
-viewer is started: a file can be looked at anywhere, later, and again. Places are in the scene's local frame.
+A sink for streams (`RerunSink`), and a fit's input and result with one view per step (`write_rerun`). Nothing is served
+and no viewer is started: the file can be viewed anywhere and at any time. Coordinates are in the scene's local frame.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Camera, Scene
 
-rerun: Any = import_module("rerun")  # it comes without what tells its names to a type checker
+rerun: Any = import_module("rerun")  # the package has no type information
 APPLICATION, TIMELINE = "og_pointcloud", "view"
 JPEG_QUALITY = 80
 
 
 class RerunSink:
-    """Logs views and instances to a file; `rerun_sink` makes one. Steps are integers that rise."""
+    """Logs views and instances to a file; made by `rerun_sink`. Steps are increasing integers."""
 
     def __init__(self, recording: Any) -> None:
         self._recording = recording
@@ -36,7 +36,7 @@ class RerunSink:
     def frame(
         self, step: int, camera: Camera, image: NDArray[np.uint8] | None, masks: NDArray[np.integer] | None
     ) -> None:
-        """A view: its camera, of the local frame; its image (H, W, 3) uint8 and masks (H, W), -1 outside, if any."""
+        """Log a view: its camera in the local frame; its image (H, W, 3) uint8 and masks (H, W), -1 outside, if any."""
         self._recording.set_time(TIMELINE, sequence=step)
         from_camera = rerun.Transform3D(translation=camera.center, mat3x3=camera.world_to_camera[:3, :3].T)
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
@@ -47,15 +47,15 @@ class RerunSink:
         if image is not None:
             self._recording.log("world/camera/image", rerun.Image(image).compress(jpeg_quality=JPEG_QUALITY))
         if masks is not None:
-            # 0, which the viewer leaves clear, is outside, and what the lens did not see.
+            # 0, which the viewer leaves transparent, is outside every mask, or not seen by the lens.
             ids = np.asarray(np.maximum(masks, -1) + 1, np.uint16)
             self._recording.log("world/camera/masks", rerun.SegmentationImage(ids, opacity=0.5))
 
     def instances(self, step: int, scene: LabelledScene, appeared: NDArray[np.bool_]) -> None:
-        """The scene's points, those of instances that have appeared so far, (K,) bool, in the instances' colors; and
-        these instances' boxes with their best words."""
+        """Log the scene's points, colored by instance for the instances that have appeared so far, (K,) bool; and the
+        boxes of these instances with their best words."""
         cloud = scene.cloud
-        table = np.full((len(appeared) + 3, 3), NO_LABEL, np.uint8)  # ids below 0 index it from its end
+        table = np.full((len(appeared) + 3, 3), NO_LABEL, np.uint8)  # negative ids index it from its end
         table[: len(appeared)][appeared] = label_colors(np.flatnonzero(appeared))
         known = [
             (row, box) for row in scene.instances if appeared[row.id] and (box := row.axis_aligned_box) is not None
@@ -72,14 +72,14 @@ class RerunSink:
         self._recording.log("world/boxes", lines)
 
     def text(self, text: str) -> None:
-        """A line beside the first view."""
+        """Log a line of text at the first view."""
         self._recording.set_time(TIMELINE, sequence=0)
         self._recording.log("fit", rerun.TextLog(text))
 
 
 @contextmanager
 def rerun_sink(path: StrPath) -> Iterator[RerunSink]:
-    """A sink whose file takes its place when the block ends without an error."""
+    """A sink whose file is moved to its path when the block ends without an error."""
     recording = rerun.RecordingStream(APPLICATION)
     with replacing(path) as file:
         recording.save(file.name)  # written as it is logged: memory does not grow with the stream
@@ -90,9 +90,9 @@ def rerun_sink(path: StrPath) -> Iterator[RerunSink]:
 
 
 def write_rerun(path: StrPath, capture: Scene, cloud: LabelledCloud, *, progress: bool = False) -> None:
-    """What a fit saw and made: each view with its masks, the instances it is the first to show, the stages' seconds.
+    """Write a fit's input and result: each view with its masks, instances as they first appear, seconds per stage.
 
-    capture: what was fitted. cloud: what came of it.
+    capture: the fitted scene. cloud: the result.
     """
     scene, appeared = LabelledScene.from_cloud(cloud), np.zeros(len(cloud.instances), bool)
     with rerun_sink(path) as sink:

@@ -1,7 +1,7 @@
-"""A live page of scenes: type any word, click for what a thing is, choose the colors. Needs the extra 'serve'.
+"""A live page of scenes: type any word, click a thing to identify it, choose the colors. Needs the extra 'serve'.
 
-viser shows the points and carries the words; what they mean is in ``live``. Everybody who opens the page sees the same.
-It is served on this machine alone unless told otherwise: there is no password.
+viser shows the points and the controls; ``live`` computes the answers. Everybody who opens the page sees the same. By
+default it is served to this machine alone: there is no password.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from og_pointcloud.show.live import Answer, LiveScene
 from og_pointcloud.show.screen import Screen
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
-LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
+LOOPBACK, PORT, PORT_COUNT = "127.0.0.1", 8080, 1 << 16
 HEIGHT_PX = 640
 """Height of the page in a notebook."""
-LISTED = 300
-"""Instances in the list, the largest ones."""
-EVERYTHING = "all"
+MAX_INSTANCES_LISTED = 300
+"""Instances in the list: the largest ones."""
+ALL_INSTANCES = "all"
 TITLE = "og_pointcloud"
 ROW = '<div style="display:flex;gap:8px;align-items:center;padding:1px 0">{}</div>'
 SWATCH = '<i style="flex:none;width:12px;height:12px;border-radius:50%;background:rgb{}"></i>'
@@ -44,7 +44,7 @@ CARD = '<div style="padding:0 12px 8px;font-size:13px;overflow-wrap:anywhere">{}
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """host: the address to listen on; "0.0.0.0" lets others in. port: the first to try. up: (3,) which way is up."""
+    """host: the address to listen on; "0.0.0.0" lets others in. port: the first to try. up: (3,) upward direction."""
 
     host: str = LOOPBACK
     port: int = PORT
@@ -52,28 +52,30 @@ class ServeSettings:
 
 
 def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None) -> LivePage:
-    """Start a page of scenes by their titles, at least one, and return at once.
+    """Start a page of one or more scenes, given by title, and return at once.
 
-    OgPointcloudError where one has no point to show, or nothing may listen at the address.
+    OgPointcloudError if a scene has no point to show, or the address cannot be listened on.
     """
     empty = [title for title, live in scenes.items() if len(live.xyz) == 0]
     if empty or not scenes:
         raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no point to show; expected at least one")
     settings = settings or ServeSettings()
-    unit_up(settings.up)  # which refuses what is no direction
+    unit_up(settings.up)  # raises if it is no direction
     _check_address(settings.host, settings.port)
     return LivePage(scenes, settings)
 
 
 def _check_address(host: str, port: int) -> None:
-    """Refuse an address that is not this machine's: viser would try port after port there, and never say so."""
+    """Refuse an address that is not this machine's: viser would silently try port after port."""
     try:
         socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
         cure = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them"
         raise OgPointcloudError(f"nothing can listen at '{host}' ({error}); {cure}") from None
-    if not 0 <= port < PORTS:
-        raise OgPointcloudError(f"the port is {port}; expected a number from 0, for any that is free, to {PORTS - 1}")
+    if not 0 <= port < PORT_COUNT:
+        raise OgPointcloudError(
+            f"the port is {port}; expected a number from 0, for any that is free, to {PORT_COUNT - 1}"
+        )
 
 
 def show(scene: Any, labels: Any = None, *, text_features: Any = None) -> LivePage:
@@ -83,12 +85,12 @@ def show(scene: Any, labels: Any = None, *, text_features: Any = None) -> LivePa
 
 
 class LivePage:
-    """A page that is being served. url: where. ``stop`` ends it."""
+    """A page that is being served at ``url``. ``stop`` ends it."""
 
     def __init__(self, scenes: Mapping[str, LiveScene], settings: ServeSettings) -> None:
         self._scenes, self._settings = dict(scenes), settings
         self._lock = threading.RLock()  # viser calls from several threads
-        with redirect_stdout(io.StringIO()):  # a box with the addresses, even where it is to be silent
+        with redirect_stdout(io.StringIO()):  # viser prints a box with the addresses even if verbose is False
             self._server = viser.ViserServer(settings.host, settings.port, TITLE, verbose=False)
         self._live = next(iter(self._scenes.values()))
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
@@ -98,18 +100,18 @@ class LivePage:
         self._screens: dict[int, Screen] = {}
         self._add_controls()
         self._show_scene()
-        self._server.on_client_connect(self._came)
-        self._server.on_client_disconnect(self._left)
+        self._server.on_client_connect(self._client_connected)
+        self._server.on_client_disconnect(self._client_left)
 
     @property
     def url(self) -> str:
-        """Where a browser of this machine finds it."""
+        """Address of the page for a browser on this machine."""
         host = LOOPBACK if self._settings.host in ("0.0.0.0", "::") else self._settings.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
 
     @property
     def is_open(self) -> bool:
-        """Whether others than this machine can reach it."""
+        """Whether other machines can reach it."""
         return self._settings.host not in ("127.0.0.1", "localhost", "::1")
 
     def wait(self) -> None:
@@ -122,7 +124,7 @@ class LivePage:
             self.stop()
 
     def stop(self) -> None:
-        """End the page; browsers say that it is gone."""
+        """End the page; browsers show that the connection is lost."""
         for screen in list(self._screens.values()):
             screen.close()
         with redirect_stdout(io.StringIO()):
@@ -145,7 +147,7 @@ class LivePage:
         self._answer = gui.add_html("")
         self._mode = gui.add_dropdown("colors", self._live.modes)
         self._mode.on_update(self._guarded(self._change_mode))
-        self._list: Any = gui.add_dropdown("instance", (EVERYTHING,))
+        self._list: Any = gui.add_dropdown("instance", (ALL_INSTANCES,))
         self._list.on_update(self._guarded(self._chosen))
         self._size = gui.add_slider("point size", 0.3, 4.0, 0.05, 1.0)
         self._size.on_update(self._guarded(self._resize))
@@ -153,7 +155,7 @@ class LivePage:
         self._legend = gui.add_html("")
 
     def _guarded(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """A handler for viser: runs one at a time, and only for what a person did, not for what the page set itself."""
+        """A handler for viser: runs one at a time, and only for a user's action, not for values set by the page."""
 
         def called(event: Any) -> None:
             if event.client is not None:
@@ -163,29 +165,29 @@ class LivePage:
         return called
 
     def _typed(self) -> None:
-        """Stored words, and none, are answered while typing; others may need an encoder, and wait for Enter."""
+        """Stored words and empty text are answered while typing; others may need an encoder, and wait for Enter."""
         own = self._live.scene.vocabulary
         if not self._word.value.strip() or (own and self._word.value.strip() in own.names):
             self._ask()
 
     def _ask(self) -> None:
-        self._tell(self._live.ask(self._word.value))
-        self._list.value = EVERYTHING
+        self._show_answer(self._live.ask(self._word.value))
+        self._list.value = ALL_INSTANCES
 
     def _chosen(self) -> None:
         row = self._list.value
         if row not in self._list.options:
-            return  # of a scene that another browser has just changed
+            return  # another browser has just changed the scene
         self._word.value = ""
-        self._tell(self._live.ask("") if row == EVERYTHING else self._live.choose(int(row.split(" ")[0])))
+        self._show_answer(self._live.ask("") if row == ALL_INSTANCES else self._live.choose(int(row.split(" ")[0])))
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         camera = event.client.camera
         focal_px = camera.image_height / 2 / np.tan(camera.fov / 2)
         with self._lock:
             eye = np.array(event.ray_origin) + self._middle
-            self._tell(self._live.click(eye, np.array(event.ray_direction), focal_px))
-            self._word.value, self._list.value = "", EVERYTHING
+            self._show_answer(self._live.click(eye, np.array(event.ray_direction), focal_px))
+            self._word.value, self._list.value = "", ALL_INSTANCES
 
     def _change_mode(self) -> None:
         self._live.mode = self._mode.value
@@ -197,7 +199,7 @@ class LivePage:
         self._show_scene()
 
     def _photograph(self, event: viser.GuiEvent) -> None:
-        """What the browser that asked sees, as a PNG that it saves."""
+        """Send the requesting browser its current view as a PNG to save."""
         import imageio.v3
 
         client = event.client
@@ -225,20 +227,20 @@ class LivePage:
         for screen in self._screens.values():
             screen.show(live, self._middle, self._size.value)
         self._mode.options, self._mode.value = live.modes, live.mode
-        rows = [row for row in live.instances.largest(LISTED) if row.points]
-        self._list.options = (EVERYTHING, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
-        self._word.value, self._list.value = "", EVERYTHING
+        rows = [row for row in live.instances.largest(MAX_INSTANCES_LISTED) if row.points]
+        self._list.options = (ALL_INSTANCES, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
+        self._word.value, self._list.value = "", ALL_INSTANCES
         self._legend.content = legend_html(live)
-        self._tell(live.ask(""))
+        self._show_answer(live.ask(""))
 
-    def _came(self, client: viser.ClientHandle) -> None:
+    def _client_connected(self, client: viser.ClientHandle) -> None:
         with self._lock:
             if client.client_id not in self._server.get_clients():
-                return  # it has left already, perhaps before this: both come from threads
+                return  # it has already left: the two events come from different threads
             screen = self._screens[client.client_id] = Screen(client)
             screen.show(self._live, self._middle, self._size.value)
 
-    def _left(self, client: viser.ClientHandle) -> None:
+    def _client_left(self, client: viser.ClientHandle) -> None:
         with self._lock:
             if screen := self._screens.pop(client.client_id, None):
                 screen.close()
@@ -252,21 +254,20 @@ class LivePage:
         for screen in self._screens.values():
             screen.paint(colors)
 
-    def _tell(self, answer: Answer) -> None:
-        """Show an answer and its colors. Beside points it goes first, by itself: a browser shows that at once, and
-        colors with the next frame that it draws. Beside pictures all goes together: another frame would hold them up.
-        """
-        together = any(screen.sends_pictures for screen in self._screens.values())
-        if together:
+    def _show_answer(self, answer: Answer) -> None:
+        """Show an answer and its colors. With points, the text is sent first: a browser shows it at once, the colors
+        with its next frame. With pictures, both are sent together: an extra frame would delay the picture."""
+        with_pictures = any(screen.sends_pictures for screen in self._screens.values())
+        if with_pictures:
             self._paint()
         self._answer.content = answer_html(answer)
         self._server.flush()
-        if not together:
+        if not with_pictures:
             self._paint()
 
 
 def answer_html(answer: Answer) -> str:
-    """The answer as HTML. Names come from files, so their text is escaped."""
+    """The answer as HTML. Names come from files, so they are escaped."""
     title, *lines, note = map(html.escape, (answer.title, *answer.lines, answer.note))
     bars = [BAR.format(html.escape(name), score, score) for name, score in answer.bars]
     return CARD.format("".join([f"<b>{title}</b>", *map(GREY.format, lines), *bars, GREY.format(note)]))

@@ -1,8 +1,8 @@
-"""Columns of a cloud or 3DGS file that an edit changes: recolored, moved into another frame, put behind others.
+"""Edits of the columns of a cloud or 3DGS file: recolor, transform to another frame, append.
 
 A splat's color seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
-Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
-among themselves: the color that was seen along d is then seen along R d.
+Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Rotating a splat mixes coefficients within each degree:
+the color that was seen along d is then seen along R d.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 RGB = ("red", "green", "blue")
 COLORS = (*RGB, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
-"""All names of color columns, which give way to RGB of type uchar."""
-DARK = 0.05
-"""Mean luminance below which an object's shading is too faint to be kept in a new color at its full strength."""
+"""All names of color columns, which are replaced by RGB of type uchar."""
+MIN_MEAN_LUMINANCE = 0.05
+"""Mean luminance below which an object's shading is too faint to be kept at full strength in a new color."""
 MAX_DEGREE = 3
-"""Highest degree of the harmonics that files have."""
+"""Highest degree of spherical harmonics in files."""
 
 
 def recolored(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows:
-    """The rows with those chosen in another color, as harmonics, as red green blue, or both; a plain cloud without
-    colors becomes gray. color: (3,), 0 to 1; the mean of the object becomes that color, its light and dark stay."""
+    """The rows with the chosen ones in another color, as harmonics, red green blue, or both; a plain cloud without
+    colors becomes gray. color: (3,), 0 to 1; it becomes the object's mean color, and the object keeps its shading."""
     columns, rgb = _columns(rows), colors(rows)
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
@@ -57,9 +57,9 @@ def recolored(rows: Rows, chosen: NDArray[np.bool_], color: DoubleArray) -> Rows
 
 
 def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleArray) -> tuple[Rows, tuple[str, ...]]:
-    """The rows in another frame, x -> scale * rotation @ x + translation; and what could not follow.
+    """The rows in another frame, x -> scale * rotation @ x + translation; and notes of what could not be transformed.
 
-    Positions become float64. Normals, rotations and scales of Gaussians and their harmonics follow.
+    Positions become float64. Normals, rotations and scales of Gaussians and their harmonics are transformed too.
     """
     columns = _columns(rows)
     columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
@@ -69,7 +69,7 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
     if set(LOG_SCALE) <= set(columns):  # 3DGS stores logarithms of standard deviations
         _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
-        _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION)))
+        _set(columns, ROTATION, _rotated(quaternion_of(rotation), stack_columns(rows, ROTATION)))
     rest = _rest(rows)
     _set(columns, _rest_names(rows), rotated_harmonics(rest, rotation))
     too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
@@ -77,8 +77,8 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, with the columns of the first; and notes of what was lost. Where the two hold colors in
-    different columns or types, both become bytes. Positions become float64 where the first's type would move points
+    """The rows of both, with the columns of the first; and notes of what was lost. If the two have colors in different
+    columns or types, both become bytes. Positions become float64 if the first's type would move points
     (`storable_positions`)."""
     first, second = _columns(base), _columns(added)
     places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
@@ -98,21 +98,21 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
 
 
 def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
-    """The columns with colors (n, 3) as red, green, blue of one byte, in place of all that they were."""
+    """The columns with colors (n, 3) as red, green, blue of one byte, replacing all color columns of other types."""
     if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
         columns = {name: column for name, column in columns.items() if name not in COLORS}
     return columns | dict(zip(RGB, rgb.T, strict=True))
 
 
 def _color_map(base: DoubleArray, color: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
-    """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color; and (3,) what is added to them
-    where they are too dark for it, so that their mean becomes that color."""
+    """(3, 3) matrix for colors (n, 3), which gives their luminance times the new color; and (3,) offset for colors that
+    are too dark for that, so that their mean becomes the new color."""
     mean = float((base @ LUMINANCE).mean())
-    return np.outer(color, LUMINANCE) / max(mean, DARK), color * max(0.0, 1 - mean / DARK)
+    return np.outer(color, LUMINANCE) / max(mean, MIN_MEAN_LUMINANCE), color * max(0.0, 1 - mean / MIN_MEAN_LUMINANCE)
 
 
-def _turned(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
-    """(n, 4) quaternions wxyz times a turn from the left (Hamilton); their lengths, which mean nothing, stay."""
+def _rotated(turn: DoubleArray, quaternions: DoubleArray) -> DoubleArray:
+    """(n, 4) quaternions wxyz times a rotation from the left (Hamilton); their lengths, which mean nothing, stay."""
     quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
     (a, b, c, d), (w, x, y, z) = turn, quaternions.T
     product = [
@@ -141,8 +141,8 @@ def _set(
     values: NDArray[np.floating],
     chosen: NDArray[np.bool_] | slice = slice(None),
 ) -> None:
-    """Give the chosen rows other values (rows, ..), one column a name, in the columns' types; arrays are not changed in
-    place."""
+    """Set new values (rows, ..) in the chosen rows, one column per name, in the columns' types; arrays are copied, not
+    changed in place."""
     for name, column in zip(names, values.reshape(len(values), len(names)).T, strict=True):
         columns[name] = columns[name].copy()
         columns[name][chosen] = column
@@ -167,9 +167,9 @@ def _rest(rows: Rows) -> DoubleArray:
 
 
 def rotated_harmonics(rest: DoubleArray, rotation: DoubleArray) -> DoubleArray:
-    """Coefficients of splats that are turned by a rotation (3, 3) of column vectors.
+    """Coefficients of splats rotated by a matrix (3, 3) that acts on column vectors; same shape as rest.
 
-    rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant. The same shape comes back.
+    rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant.
     """
     turned, directions = rest.copy(), np.random.default_rng(0).normal(size=(32, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -177,14 +177,14 @@ def rotated_harmonics(rest: DoubleArray, rotation: DoubleArray) -> DoubleArray:
         block = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
         if block.stop > rest.shape[2]:
             break
-        # Turned harmonics of one degree are mixtures of that degree, Y(R' d) = Y(d) M: any few directions give M.
+        # Rotated harmonics of a degree are linear combinations of it, Y(R' d) = Y(d) M: a few directions give M.
         before, after = _harmonics(directions @ rotation, degree), _harmonics(directions, degree)
         turned[..., block] = rest[..., block] @ np.linalg.lstsq(after, before, rcond=None)[0].T
     return turned
 
 
 def _harmonics(directions: DoubleArray, degree: int) -> DoubleArray:
-    """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree, but for one factor."""
+    """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree, up to one factor."""
     x, y, z = directions.T
     if degree == 1:
         columns = [-y, z, -x]

@@ -1,4 +1,4 @@
-"""Where to look from: the view from obliquely above that shows the most labelled points."""
+"""Choice of a viewpoint: the view from obliquely above that shows the most labelled points."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from og_pointcloud.formats.poses import rigid, upright_axes
 from og_pointcloud.scene import Camera, DoubleArray
 
 FOCAL = 1.7
-"""Focal length in half heights of the picture: a view angle of 61 degrees."""
+"""Focal length in half heights of the picture: a vertical view angle of 61 degrees."""
 ELEVATIONS_DEG = (30.0, 50.0)
-DIRECTIONS = 12
-CELLS = (96, 60)
-"""Pixels, across and down, in which the nearest point counts."""
-SAMPLE = 20_000
-TRIM = (3.0, 97.0)
-"""Percentiles between which points count for the frame: strays should not make everything small."""
-DISTANCE = 1.6
+AZIMUTHS = 12
+GRID_PX = (96, 60)
+"""Width and height of the coarse picture in which each pixel shows its nearest point."""
+MAX_SAMPLE_POINTS = 20_000
+TRIM_PERCENTILES = (3.0, 97.0)
+"""Percentiles of the points that the frame must contain: strays should not make everything small."""
+EYE_DISTANCE_HALF_DIAGONALS = 1.6
 """Distance of the eye while directions are compared, in half diagonals of the points."""
-FILLED = 0.9
-"""Share of the picture's height or width that the points fill in the end."""
+FILLED_SHARE = 0.9
+"""Share of the picture's height or width that the points finally fill."""
 
 
 @dataclass(frozen=True)
@@ -41,30 +41,31 @@ class Viewpoint:
         return np.stack([right, np.cross(back, right), -back])
 
     def camera(self, width: int, height: int, focal_px: float) -> Camera:
-        """A camera of world coordinates; the middle of its image shows the target."""
+        """A camera in world coordinates; the middle of its image shows the target."""
         rotation = self.axes() * [[1], [-1], [1]]  # cameras have y down
         pose = rigid(rotation, -rotation @ self.eye)
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
 
 def choose_viewpoint(xyz: DoubleArray, labelled: NDArray[np.bool_], up: DoubleArray) -> Viewpoint:
-    """xyz: (n, 3), n >= 1, finite. labelled: (n,), points that should be seen; all, if none is. up: (3,) unit."""
-    sample = np.linspace(0, len(xyz) - 1, min(len(xyz), SAMPLE)).astype(np.int64)
+    """The viewpoint for points xyz (n, 3), n >= 1, finite. labelled: (n,), points that should be visible; all if none
+    is set. up: (3,) unit vector."""
+    sample = np.linspace(0, len(xyz) - 1, min(len(xyz), MAX_SAMPLE_POINTS)).astype(np.int64)
     points, wanted = xyz[sample], labelled[sample] if labelled.any() else np.ones(len(sample), bool)
-    low, high = np.percentile(points, TRIM, axis=0)
+    low, high = np.percentile(points, TRIM_PERCENTILES, axis=0)
     target = low + (high - low) / 2
-    distance = DISTANCE * max(float(np.linalg.norm(high - low)) / 2, 1e-9)
-    # Candidates all around at two heights; side is any direction across up.
+    distance = EYE_DISTANCE_HALF_DIAGONALS * max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+    # Candidates all around at two elevations; side is any direction perpendicular to up.
     side, across, _ = upright_axes(up)
     directions = [
         np.cos(tilt) * (np.cos(turn) * side + np.sin(turn) * across) + np.sin(tilt) * up
         for tilt in np.deg2rad(ELEVATIONS_DEG)
-        for turn in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+        for turn in np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS
     ]
     views = [Viewpoint(target + distance * direction, target, up) for direction in directions]
-    best = max(views, key=lambda view: _in_sight(points, wanted, view))
+    best = max(views, key=lambda view: _visible_cells(points, wanted, view))
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    # Of a handful of points each may be the outermost along some axis: then all count.
+    # Each of a few points may be the outermost along some axis: then all count.
     return _framed(points[inside] if inside.any() else points, best)
 
 
@@ -72,16 +73,16 @@ def _framed(points: DoubleArray, view: Viewpoint) -> Viewpoint:
     """The same direction and target from as near as possible with all points still in the picture."""
     axes, distance = view.axes(), float(np.linalg.norm(view.eye - view.target))
     x, y, behind = axes @ (points - view.target).T
-    aside = np.maximum(np.abs(x) * CELLS[1] / CELLS[0], np.abs(y))
-    nearest = float((FOCAL / FILLED * aside - behind).max())  # FOCAL aside / (distance + behind) <= FILLED
+    offset = np.maximum(np.abs(x) * GRID_PX[1] / GRID_PX[0], np.abs(y))
+    nearest = float((FOCAL / FILLED_SHARE * offset - behind).max())  # FOCAL offset/(distance + behind) <= FILLED_SHARE
     return Viewpoint(view.target - max(nearest, 0.1 * distance) * axes[2], view.target, view.up)
 
 
-def _in_sight(points: DoubleArray, wanted: NDArray[np.bool_], view: Viewpoint) -> int:
-    """Cells of a coarse picture whose nearest point is a wanted one."""
-    camera = view.camera(*CELLS, FOCAL * CELLS[1] / 2)
+def _visible_cells(points: DoubleArray, wanted: NDArray[np.bool_], view: Viewpoint) -> int:
+    """Number of pixels of a coarse picture whose nearest point is a wanted one."""
+    camera = view.camera(*GRID_PX, FOCAL * GRID_PX[1] / 2)
     uv_px, depth = camera.project(points)
-    seen = np.flatnonzero(camera.shows(uv_px))
-    seen = seen[np.argsort(depth[seen], kind="stable")]  # the nearest first
-    column, row = uv_px[seen].astype(np.int64).T
-    return int(wanted[seen][np.unique(row * CELLS[0] + column, return_index=True)[1]].sum())
+    in_image = np.flatnonzero(camera.shows(uv_px))
+    in_image = in_image[np.argsort(depth[in_image], kind="stable")]  # the nearest first
+    column, row = uv_px[in_image].astype(np.int64).T
+    return int(wanted[in_image][np.unique(row * GRID_PX[0] + column, return_index=True)[1]].sum())

@@ -1,1 +1,1 @@
-"""From words to vectors: the tokenizer and encoder that the base install runs, banks of words, and stored vectors."""
+"""From words to vectors: tokenizer and encoder for the base install, word banks, and stored vectors."""

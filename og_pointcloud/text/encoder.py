@@ -1,15 +1,15 @@
-"""Words -> text vectors of a feature space: an encoder that ``og-pointcloud export text`` wrote, run anywhere.
+"""Words -> text vectors of a feature space, by an encoder that ``og-pointcloud export text`` wrote.
 
-A folder, or the members ``text_encoder/`` of a .ogpc file, nothing in it pickled:
+It is a folder, or the members ``text_encoder/`` of a .ogpc file; nothing in it is pickled:
 
-  manifest.json       format, schema_version, feature_space, width, context_length, templates, precision, how texts are
-                      padded, bytes, crc32 and sha256 of the other files, parity figures against torch
+  manifest.json       format, schema_version, feature_space, width, context_length, templates, precision, padding of
+                      texts, bytes, crc32 and sha256 of the other files, parity figures against torch
   text_encoder.onnx   tokens (B, T) int64 -> text (B, D) float32, unit rows
   tokenizer.json      vocabulary and merges (see ``tokenizer``)
   word_bank.npy       (B, D) float16, everyday words in the manifest's templates (see ``choosing``)
 
-numpy and onnxruntime run it, and the tokenizers package where the tokenizer is not CLIP's. What is read is checked
-before it is run: it may come from a stranger.
+It needs numpy and onnxruntime, and the tokenizers package if the tokenizer is not CLIP's. Files are untrusted, and are
+checked before they are run.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import MANIFEST, MODEL_NAME, EncoderFormat, home_folder, open_session
-from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
+from og_pointcloud.text.tokenizer import MAX_CHARACTERS, open_tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
-"""Environment variable: folders, separated as in PATH, that are encoders or hold some."""
+"""Environment variable: folders, separated as in PATH, that are encoders or contain some."""
 GRAPH, TOKENIZER, WORD_BANK = "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
 OPERATORS = frozenset({
     "Add", "ArgMax", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Equal", "Erf",
@@ -44,14 +44,14 @@ OPERATORS = frozenset({
     "Mul", "Pow", "Range", "ReduceL2", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Split", "Squeeze", "Tanh",
     "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
-"""All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
+"""The operators allowed in an encoder's graph: arithmetic without loops, random numbers, or graphs inside nodes."""
 DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
-"""The encoder that comes with the library: it knows the demo's room and nothing else of the world."""
+"""The encoder that comes with the library: it knows the demo room and nothing else."""
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
-MOST_TEMPLATES, LONGEST_TEMPLATE = 128, 400
-"""Templates an encoder may have, and characters of one. CLIP was published with 80 templates for ImageNet."""
-VECTORS_REMEMBERED = 1 << 14
+MAX_TEMPLATES, MAX_TEMPLATE_CHARACTERS = 128, 400
+"""Largest number of templates of an encoder, and of characters of one. CLIP has 80 templates for ImageNet."""
+MAX_CACHED_VECTORS = 1 << 14
 ENCODER = EncoderFormat(
     "og-text-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export text", {TOKENIZER: 1 << 26, WORD_BANK: 1 << 26},
     optional=WORD_BANK,
@@ -60,15 +60,15 @@ ENCODER = EncoderFormat(
 
 
 class TextEncoder:
-    """Encodes words; make one with ``read_text_encoder`` or ``encoder_for``. Safe to share by threads.
+    """Encodes words; made by ``read_text_encoder`` or ``encoder_for``. Thread-safe.
 
-    The vectors of 16,384 texts are remembered: a label that is asked again costs a look-up.
+    The vectors of 16,384 texts are cached: a repeated label costs a look-up.
     """
 
     def __init__(self, files: Mapping[str, bytes], where: str) -> None:
-        """files: the bytes of ENCODER's files. where: what errors begin with, a path. OgPointcloudError if damaged.
+        """files: the bytes of ENCODER's files. where: prefix of error texts, a path. OgPointcloudError if damaged.
 
-        ``word_bank``: everyday words as this encoder has them, None for one that was made without.
+        ``word_bank``: everyday words encoded by this encoder, None if it was made without.
         """
         self.where = where
         self.manifest = ENCODER.checked(files, where, _check_fields)
@@ -83,36 +83,36 @@ class TextEncoder:
             self._tokenizer = open_tokenizer(files[TOKENIZER], self.context_length, self.manifest["vocabulary"])
         except ValueError as error:
             raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {ENCODER.remake}") from None
-        self._remembered: dict[str, NDArray[np.float32]] = {}
+        self._cache: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, names: Sequence[str]) -> NDArray[np.float32]:
-        """(len(names), D) float32, unit rows: of each name the mean over the manifest's templates."""
-        # The ensemble of prompts of CLIP (Radford et al. 2021): unit vectors are averaged, their mean made unit again.
-        texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in self.templates]
+        """(len(names), D) float32, unit rows: for each name the mean over the manifest's templates."""
+        # CLIP's prompt ensemble (Radford et al. 2021): unit vectors are averaged, and the mean is normalized again.
+        texts = [template.replace("{}", name[:MAX_CHARACTERS]) for name in names for template in self.templates]
         vectors = self.encode(texts).reshape(len(names), len(self.templates), self.width).mean(axis=1)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
-        """(len(texts), D) float32, unit rows: the texts as they stand."""
-        remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}  # full: begun anew
-        missing = [text for text in dict.fromkeys(texts) if text not in remembered]
+        """(len(texts), D) float32, unit rows: the texts as they are, without templates."""
+        cache = self._cache if len(self._cache) < MAX_CACHED_VECTORS else {}  # full: a new one
+        missing = [text for text in dict.fromkeys(texts) if text not in cache]
         for batch, tokens in self._batches(missing):
             vectors = ENCODER.vectors(self._session, tokens, (len(tokens), self.width), self.where)
-            remembered.update(zip(batch, vectors, strict=True))
-        self._remembered = remembered  # replaced, never emptied: another thread may be reading the old one
-        return np.array([remembered[text] for text in texts], np.float32).reshape(len(texts), self.width)
+            cache.update(zip(batch, vectors, strict=True))
+        self._cache = cache  # replaced, never emptied: another thread may be reading the old one
+        return np.array([cache[text] for text in texts], np.float32).reshape(len(texts), self.width)
 
     def tokens(self, text: str) -> list[int]:
-        """Token ids of a text as the encoder is given them: cut to the context, padded only where it must be."""
+        """Token ids of a text, the encoder's input: cut to the context, padded only if the encoder needs it."""
         ids = self._tokenizer(text)
         pad = self.manifest["pad_id"]
         return ids if pad is None else ids + [pad] * (self.context_length - len(ids))
 
     def _batches(self, texts: Iterable[str]) -> Iterator[tuple[list[str], NDArray[np.int64]]]:
-        """Batches of texts with equally many tokens, so that none is padded for another's sake.
+        """Batches of texts with equally many tokens, so that none needs padding to the length of another.
 
-        An int8 graph scales the activations of a whole run alike: there each text runs alone, so that its vector does
-        not depend on its neighbors.
+        An int8 graph scales the activations of a whole batch together: with one, each text runs alone, so that its
+        vector does not depend on the others.
         """
         by_length: dict[int, list[tuple[str, list[int]]]] = {}
         for text in texts:
@@ -130,9 +130,9 @@ class TextEncoder:
 
 
 def read_text_encoder(folder: StrPath) -> TextEncoder:
-    """Open a folder that ``og-pointcloud export text`` wrote, checked whole; OgPointcloudError for any other.
+    """Open and check a folder that ``og-pointcloud export text`` wrote; OgPointcloudError for any other.
 
-    Asking for the same unchanged folder again gives the same encoder.
+    Cached: the same unchanged folder gives the same encoder.
     """
     path = Path(folder).resolve()
     if not (path / MANIFEST).is_file():
@@ -147,7 +147,7 @@ def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder
 
 
 def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder:
-    """``find_encoder``, but with an OgPointcloudError, which names the command that makes one, where there is none."""
+    """``find_encoder``, but if there is none, an OgPointcloudError that names the command that makes one."""
     if encoder := find_encoder(feature_space, carried):
         return encoder
     named = os.environ.get(MODELS_VARIABLE)
@@ -158,11 +158,11 @@ def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> Te
 
 
 def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder | None:
-    """The encoder of a feature space: the one that the scene carries, else the first that is found among the models.
+    """The encoder of a feature space: the one that the scene carries, else the first one found in the model folders.
 
-    carried: gives the encoder in the scene's file, if it has one (`bundle.vocabulary.carried_encoder`). Looked through
-    are the folders of OG_POINTCLOUD_MODELS, then the user's cache folder, then the library's own; each may be an
-    encoder, or hold encoders. None where there is none; OgPointcloudError where there is one that cannot be used.
+    carried: returns the encoder in the scene's file, if it has one (`bundle.vocabulary.carried_encoder`). The search
+    order is the folders of OG_POINTCLOUD_MODELS, the user's cache folder, the library's own; each may be an encoder,
+    or contain encoders. None if there is none; OgPointcloudError if there is one that cannot be used.
     """
     if carried is not None and (encoder := carried()):
         if encoder.feature_space != feature_space:
@@ -176,8 +176,8 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
 
 
 def export_command(feature_space: str) -> str:
-    """The command that makes the encoder of a feature space, where it will be found."""
-    if MODEL_NAME.fullmatch(feature_space):  # OWNER/MODEL, found where it was fetched to
+    """The command that makes the encoder of a feature space in a folder where it will be found."""
+    if MODEL_NAME.fullmatch(feature_space):  # OWNER/MODEL, found in the cache of fetched models
         return f"og-pointcloud export text {feature_space}"
     return shlex.join(["og-pointcloud", "export", "text", "MODEL_FOLDER", "--feature-space", feature_space])
 
@@ -193,12 +193,12 @@ def cache_folder() -> Path:
 
 
 def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
-    """At least one text with ``{}`` in it, of bounded number and length, else OgPointcloudError."""
+    """The templates: at least one text with ``{}`` in it, of limited number and length; else OgPointcloudError."""
     templates = (templates,) if isinstance(templates, str) else tuple(templates)
-    if len(templates) > MOST_TEMPLATES or any(len(str(template)) > LONGEST_TEMPLATE for template in templates):
+    if len(templates) > MAX_TEMPLATES or any(len(str(template)) > MAX_TEMPLATE_CHARACTERS for template in templates):
         raise OgPointcloudError(
             f"{len(templates)} templates of up to {max(len(str(template)) for template in templates)} characters; "
-            f"expected at most {MOST_TEMPLATES} of {LONGEST_TEMPLATE}: each is encoded for every word"
+            f"expected at most {MAX_TEMPLATES} of {MAX_TEMPLATE_CHARACTERS}: each is encoded for every word"
         )
     wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
     if wrong or not templates:
@@ -210,7 +210,7 @@ def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
 
 
 def model_folders() -> list[Path]:
-    """Where encoders are looked for, in this order: OG_POINTCLOUD_MODELS, the cache, the library's demo encoder."""
+    """Folders searched for encoders, in this order: OG_POINTCLOUD_MODELS, the cache, the library's demo encoder."""
     named = os.environ.get(MODELS_VARIABLE, "").split(os.pathsep)
     return [*(Path(folder).expanduser() for folder in named if folder), cache_folder(), DEMO_ENCODER]
 

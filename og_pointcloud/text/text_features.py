@@ -1,7 +1,7 @@
-"""Files of words: lists, one a line; and text features, names with their vectors, as an encoder gave them.
+"""Files of words: lists with one word per line; and text features, names with the vectors that an encoder gave them.
 
-Text features are an .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_space``, the name of the
-encoder.
+Text features are an .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_space``, the encoder's
+name.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from og_pointcloud.formats.npy import read_npz
 
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_WORDS_BYTES = 1 << 24
-LONGEST_NAME = 1000
+MAX_NAME_CHARACTERS = 1000
 
 
 def read_text_features(path: StrPath) -> tuple[Vocabulary, str]:
     """The names and vectors of a text-features .npz, and the name of its feature space.
 
-    Raises FeatureSpaceError, beginning with the path, where the file cannot be read, an entry is missing, or a name
-    comes twice, is empty, or has a vector that is zero, NaN or infinite. Nothing is unpickled.
+    Raises FeatureSpaceError, whose text begins with the path, if the file cannot be read, an entry is missing, or a
+    name is repeated, is empty, or has a vector that is zero, NaN or infinite. Nothing is unpickled.
 
     >>> import pathlib, tempfile
     >>> import numpy as np
@@ -60,17 +60,17 @@ def read_text_features(path: StrPath) -> tuple[Vocabulary, str]:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """OgPointcloudError for a name in a file that is longer than any word, or holds half a character."""
+    """OgPointcloudError for a name in a file that is longer than any word, or contains half a character."""
     for name in names:
         # Lone surrogates, halves of a character, cannot be written as UTF-8.
-        if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
+        if len(name) > MAX_NAME_CHARACTERS or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
-                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {MAX_NAME_CHARACTERS}"
             )
 
 
 def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
-    """Words with vectors (L, D) of any numbers, as float32. OgPointcloudError for an empty name and one given twice,
+    """Words with vectors (L, D) of any numeric type, as float32. OgPointcloudError for an empty or repeated name,
     FeatureSpaceError for a vector that is zero, NaN or infinite."""
     with np.errstate(over="ignore"):
         vectors = vectors.astype(np.float32, copy=False)
@@ -89,9 +89,9 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
 
 
 def read_words(path: StrPath) -> tuple[str, ...]:
-    """The words of a text file, one a line, UTF-8; empty lines and repeated words are left out.
+    """The words of a text file, one per line, UTF-8; empty lines and repeated words are skipped.
 
-    OgPointcloudError where it cannot be read, or has no words.
+    OgPointcloudError if it cannot be read, or has no words.
     """
     path = Path(path)
     try:
@@ -107,5 +107,5 @@ def read_words(path: StrPath) -> tuple[str, ...]:
 
 
 def everyday_words() -> tuple[str, ...]:
-    """The library's own words of everyday things, which an encoder makes a word bank of."""
+    """The library's list of everyday things, which an encoder turns into a word bank."""
     return read_words(Path(__file__).with_name("everyday_words.txt"))

@@ -1,8 +1,8 @@
-"""Words -> token ids, as a ``tokenizer.json`` says.
+"""Words -> token ids, by a ``tokenizer.json``.
 
-CLIP's byte pairs are implemented here, so that the base install answers typed words; any other file (SigLIP's unigrams,
-Gemma's byte pairs of SigLIP 2) goes through the ``tokenizers`` package. Both may come from a stranger: what could run
-for very long, or give other ids on another run, is refused.
+CLIP's byte-pair encoding is implemented here, so that the base install can encode typed words; any other file (SigLIP's
+unigrams, the Gemma byte pairs of SigLIP 2) goes through the ``tokenizers`` package. Both are untrusted: files that
+could make it run very long, or give different ids on another run, are refused.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from og_pointcloud.errors import OgPointcloudError, naming_extra
 
 WHITESPACE = "\t\n\v\f\r \x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"
-"""Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four control characters more."""
+"""Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four more control characters."""
 CLIP_WORDS = r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
 CLIP_SPECIALS = r"<\|startoftext\|>|<\|endoftext\|>|"
 CLIP_NORMALIZER = {
@@ -31,22 +31,22 @@ CLIP_NORMALIZER = {
         {"type": "Lowercase"},
     ],
 }
-SIGN = "[!-/:-@\\[-`{-~ ]"
-"""One character of ASCII's punctuation, or a space."""
-LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:\+|\{{2,\}})?")
-"""Regular expressions that no text makes slow: one character class, once or repeated."""
-MOST_CHARACTERS = 4096
-"""A longer text is cut here before anything else; contexts hold 77 tokens or fewer."""
-LONGEST_PIECE, MOST_ADDED = 256, 1 << 12
-"""Characters of a piece, and pieces added to the vocabulary. Unigrams take time by the square of a piece's length."""
-MOST_GROWTH = 256
-"""How many times longer a normalizer may make a text."""
+PUNCTUATION = "[!-/:-@\\[-`{-~ ]"
+"""One ASCII punctuation character, or a space."""
+LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{PUNCTUATION}|(?![\[\\\]]){PUNCTUATION})+\])(?:\+|\{{2,\}})?")
+"""Regular expressions that take linear time on any text: one character class, once or repeated."""
+MAX_CHARACTERS = 4096
+"""Longer texts are truncated first of all; contexts have 77 tokens or fewer."""
+MAX_PIECE_CHARACTERS, MAX_ADDED_PIECES = 256, 1 << 12
+"""Characters of a piece, and pieces added to the vocabulary. Unigrams take time quadratic in a piece's length."""
+MAX_GROWTH = 256
+"""Largest factor by which a normalizer may lengthen a text."""
 GROWTH = {
     "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Lowercase": 3, "Strip": 1, "StripAccents": 1, "Nmt": 1,
     "BertNormalizer": 4, "ByteLevel": 4, "Prepend": 2,
 }  # fmt: skip
-"""How many times longer each step of a normalizer makes a text at worst, by Unicode's own tables."""
-PIECES_REMEMBERED = 1 << 14
+"""Largest factor by which each normalizer lengthens a text, by Unicode's own tables."""
+MAX_CACHED_PIECES = 1 << 14
 
 
 class Tokenizer(Protocol):
@@ -55,15 +55,15 @@ class Tokenizer(Protocol):
     highest_id: int
 
     def __call__(self, text: str) -> list[int]:
-        """Ids of a text, at most the context length: a longer text loses its end, but keeps its closing tokens."""
+        """Ids of a text, at most the context length: a longer text is truncated before its closing tokens."""
         ...
 
 
 def open_tokenizer(data: bytes, context_length: int, vocabulary: int) -> Tokenizer:
-    """A tokenizer.json that may come from anywhere. ValueError says what is damaged or refused.
+    """The tokenizer of an untrusted tokenizer.json. ValueError says what is damaged or refused.
 
-    vocabulary: tokens of the model that takes its ids. MissingExtraError where it is not CLIP's and the ``tokenizers``
-    package is absent.
+    vocabulary: number of tokens of the model that takes its ids. MissingExtraError if it is not CLIP's and the
+    ``tokenizers`` package is absent.
     """
     try:
         description = json.loads(data)
@@ -82,7 +82,7 @@ def open_tokenizer(data: bytes, context_length: int, vocabulary: int) -> Tokeniz
 
 
 def _is_clip(description: dict[str, Any]) -> bool:
-    # The pattern is found in two forms, with and without the names of the special tokens.
+    # The pattern exists in two forms, with and without the names of the special tokens.
     splits = [
         {"type": "Split", "pattern": {"Regex": pattern}, "behavior": "Removed", "invert": True}
         for pattern in (CLIP_WORDS, CLIP_SPECIALS + CLIP_WORDS)
@@ -101,56 +101,56 @@ def _is_clip(description: dict[str, Any]) -> bool:
 
 
 def _byte_characters() -> tuple[str, ...]:
-    """GPT-2's printable character for each byte: itself where Latin-1 prints it, else the next from U+0100 on."""
-    # Without space (32), the no-break space (160) and the soft hyphen (173), which print nothing.
+    """GPT-2's printable character for each byte: itself if Latin-1 prints it, else the next unused from U+0100 on."""
+    # Without space (32), the no-break space (160) and the soft hyphen (173), which are invisible.
     printable = {*range(33, 127), *range(161, 173), *range(174, 256)}
     others = iter(range(256, 512))
     return tuple(chr(byte if byte in printable else next(others)) for byte in range(256))
 
 
 BYTE_CHARACTERS = _byte_characters()
-"""How byte-level vocabularies spell bytes: row b is the character of byte b."""
+"""Spelling of bytes in byte-level vocabularies: entry b is the character of byte b."""
 
 
 class ClipTokenizer:
-    """CLIP's tokenizer (a `Tokenizer`): NFC, single spaces, lower case; words; byte pairs. Safe to share by threads."""
+    """CLIP's tokenizer (a `Tokenizer`): NFC, single spaces, lower case; words; byte pairs. Thread-safe."""
 
     def __init__(self, description: Mapping[str, Any], context_length: int) -> None:
-        """description: of a tokenizer.json that is CLIP's but for its vocabulary, merges and special tokens."""
+        """description: a parsed tokenizer.json that is CLIP's except for vocabulary, merges and special tokens."""
         model, frame = description["model"], description["post_processor"]
         self._context_length = context_length
         self._start, self._end = _id(frame["cls"][1]), _id(frame["sep"][1])
         pairs = BytePairs(model["vocab"], model["merges"])
-        self._piece_ids = lru_cache(PIECES_REMEMBERED)(pairs)
+        self._piece_ids = lru_cache(MAX_CACHED_PIECES)(pairs)
         self.highest_id = max(*pairs.vocabulary.values(), self._start, self._end)
 
     def __call__(self, text: str) -> list[int]:
-        """See `Tokenizer`. A lone surrogate, which is no character, counts as U+FFFD. The names of special tokens are
-        read as the letters and signs that they are."""
+        """See `Tokenizer`. A lone surrogate, which is no character, becomes U+FFFD. The names of special tokens are
+        read as plain text."""
         ids: list[int] = []
-        for word in _words(_cleaned(_short(text))):
+        for word in _words(_normalized(_truncated(text))):
             ids += self._piece_ids("".join(BYTE_CHARACTERS[byte] for byte in word.encode()))
         return [self._start, *ids[: max(0, self._context_length - 2)], self._end]
 
 
-def _short(text: str) -> str:
-    """At most MOST_CHARACTERS, all of them characters."""
-    return text[:MOST_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+def _truncated(text: str) -> str:
+    """At most MAX_CHARACTERS of a text, with lone surrogates replaced."""
+    return text[:MAX_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
-def _cleaned(text: str) -> str:
-    """CLIP_NORMALIZER. Lower case one character at a time: no rule for a final sigma."""
+def _normalized(text: str) -> str:
+    """CLIP_NORMALIZER. Lower case one character at a time, so without the rule for a final sigma."""
     return "".join(map(str.lower, re.sub(f"[{WHITESPACE}]+", " ", unicodedata.normalize("NFC", text))))
 
 
 def _words(text: str) -> Iterator[str]:
-    """CLIP_WORDS without a library that knows \\p{L}: a second text holds the kind of each character, and runs of
-    letters and the like are matched in that."""
+    """CLIP_WORDS without a library that knows \\p{L}: a second text holds the kind of each character, and runs of one
+    kind are matched in it."""
     kinds = "".join(map(_kind, text))
     endings, runs = re.compile("'s|'t|'re|'ve|'m|'ll|'d"), re.compile("L+|N|O+")
     position = 0
     while position < len(text):
-        # Endings before runs: in the pattern 's comes before letters and before other signs.
+        # Endings before runs: in the pattern 's comes before letters and before other characters.
         if match := endings.match(text, position) or runs.match(kinds, position):
             yield text[position : match.end()]
             position = match.end()
@@ -158,7 +158,7 @@ def _words(text: str) -> Iterator[str]:
             position += 1
 
 
-@lru_cache(PIECES_REMEMBERED)
+@lru_cache(MAX_CACHED_PIECES)
 def _kind(character: str) -> str:
     """L letter, N number, S white space, O any other."""
     category = unicodedata.category(character)[0]
@@ -168,8 +168,8 @@ def _kind(character: str) -> str:
 
 
 class BytePairs:
-    """Byte-pair encoding of words (Sennrich et al. 2016): from single bytes on, the pair learnt first is joined, again
-    and again."""
+    """Byte-pair encoding of words (Sennrich et al. 2016): starting from single bytes, the pair learned first is merged,
+    repeatedly."""
 
     def __init__(self, vocabulary: Mapping[str, int], merges: list[str | list[str]]) -> None:
         self.vocabulary = {token: _id(id) for token, id in vocabulary.items()}
@@ -183,18 +183,18 @@ class BytePairs:
             self._merges[pair] = (rank, self.vocabulary[left + right])
 
     def __call__(self, word: str) -> list[int]:
-        """Ids of a word, spelled in BYTE_CHARACTERS."""
-        # The last byte carries the mark of a word's end: "at" in "cat" is another token than "at" in "cats".
+        """Ids of a word spelled in BYTE_CHARACTERS."""
+        # The last byte carries the end-of-word mark: "at" in "cat" is another token than "at" in "cats".
         ids = [self.vocabulary[character] for character in word[:-1]] + [self.vocabulary[f"{word[-1]}</w>"]]
         while known := [(*self._merges[pair], pair) for pair in pairwise(ids) if pair in self._merges]:
-            _, joined, first_learnt = min(known)
-            # Every occurrence at once, from the left: of three equal ids the first two are joined.
+            _, joined, best_pair = min(known)
+            # All occurrences at once, from the left: of three equal ids the first two are merged.
             merged: list[int] = []
             position = 0
             while position < len(ids):
-                together = tuple(ids[position : position + 2]) == first_learnt
-                merged.append(joined if together else ids[position])
-                position += 2 if together else 1
+                is_pair = tuple(ids[position : position + 2]) == best_pair
+                merged.append(joined if is_pair else ids[position])
+                position += 2 if is_pair else 1
             ids = merged
         return ids
 
@@ -209,10 +209,10 @@ def _id(value: Any) -> int:
 
 
 class OtherTokenizer:
-    """Any byte pairs or unigrams (a `Tokenizer`), by the ``tokenizers`` package. Safe to share by threads."""
+    """Any byte pairs or unigrams (a `Tokenizer`), by the ``tokenizers`` package. Thread-safe."""
 
     def __init__(self, data: bytes, context_length: int) -> None:
-        """data: a tokenizer.json that ``_check_other`` let pass."""
+        """data: a tokenizer.json that ``_check_other`` accepted."""
         with naming_extra("tokenizers", "words"):
             import tokenizers
         try:
@@ -220,12 +220,12 @@ class OtherTokenizer:
             self._tokenizer.no_padding()
             self._tokenizer.enable_truncation(context_length)
             self.highest_id = max([*self._tokenizer.get_vocab().values(), *self._tokenizer.encode("").ids], default=0)
-        except BaseException as error:  # a panic of its Rust is no Exception
+        except BaseException as error:  # a Rust panic is not an Exception
             raise ValueError(f"tokenizers does not read it ({_reason(error)})") from None
 
     def __call__(self, text: str) -> list[int]:
         """See `Tokenizer`."""
-        text = _short(text)
+        text = _truncated(text)
         try:
             return self._tokenizer.encode(text).ids
         except BaseException as error:
@@ -243,20 +243,20 @@ def _check_other(description: dict[str, Any]) -> None:
             raise ValueError(f"it looks for the pattern {pattern!r:.80}, which some texts may make slow")
 
     growth = _growth(description.get("normalizer") or {"type": "Strip"})
-    if growth > MOST_GROWTH:
-        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MOST_GROWTH}")
+    if growth > MAX_GROWTH:
+        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MAX_GROWTH}")
     vocabulary, added = model["vocab"], description.get("added_tokens") or []
     pieces = vocabulary if isinstance(vocabulary, dict) else (entry[0] for entry in vocabulary)
     longest = max((len(piece) for piece in (*pieces, *(token["content"] for token in added))), default=0)
-    if longest > LONGEST_PIECE or len(added) > MOST_ADDED:
+    if longest > MAX_PIECE_CHARACTERS or len(added) > MAX_ADDED_PIECES:
         raise ValueError(
-            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most {LONGEST_PIECE} and "
-            f"{MOST_ADDED}"
+            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most "
+            f"{MAX_PIECE_CHARACTERS} and {MAX_ADDED_PIECES}"
         )
 
 
 def _growth(step: dict[str, Any]) -> float:
-    """How many times longer a normalizer makes a text, at worst."""
+    """Largest factor by which a normalizer lengthens a text."""
     kind = step["type"]
     if kind == "Sequence":
         return math.prod(max(1.0, _growth(inner)) for inner in step["normalizers"])
@@ -267,13 +267,13 @@ def _growth(step: dict[str, Any]) -> float:
         table = base64.b64decode(step["precompiled_charsmap"] or "")
         trie = 4 + int.from_bytes(table[:4], "little")
         return max(map(len, table[trie:].split(b"\0")))
-    if kind not in GROWTH or len(step.get("prepend", "")) > LONGEST_PIECE:
+    if kind not in GROWTH or len(step.get("prepend", "")) > MAX_PIECE_CHARACTERS:
         raise ValueError(f"its normalizer is a {kind!r:.40}; expected {', '.join(GROWTH)}")
     return GROWTH[kind]
 
 
 def _patterns(value: Any) -> Iterator[str]:
-    """All regular expressions in a part of a description."""
+    """All regular expressions in a part of a tokenizer.json."""
     if isinstance(value, dict):
         if "Regex" in value:
             yield str(value["Regex"])

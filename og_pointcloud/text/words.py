@@ -1,4 +1,4 @@
-"""Labels as a user gives them -> names and text vectors of the scene's feature space."""
+"""The user's labels, in any form -> names and text vectors of the scene's feature space."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from og_pointcloud.text.text_features import checked_vocabulary, read_text_featu
 
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
 TextFeatures: TypeAlias = "StrPath | tuple[Vocabulary, str] | None"
-LONGEST_WORD = 60
-"""Characters of a word that is not known that are said again."""
-FEW_WORDS = 24
-"""Known words that are all named where one is asked for that is not among them, nor like any."""
+MAX_WORD_CHARACTERS = 60
+"""Characters of an unknown word that its error quotes."""
+MAX_LISTED_WORDS = 24
+"""An error about an unknown word that is like none of the known ones lists them all, if they are no more than this."""
 
 
 def resolve_labels(
@@ -31,17 +31,17 @@ def resolve_labels(
     feature_space: str,
     carried: CarriedEncoder | None = None,
 ) -> Vocabulary:
-    """Names, all different, with a finite vector each that is not zero.
+    """Distinct names, each with a finite nonzero vector.
 
-    labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
-    encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is, also
-    without words. Those of a set come in alphabetical order.
-    text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
-    carried: gives the encoder in the scene's file, if it has one.
-    Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
-    space and for vectors that cannot be compared.
+    labels: words, looked up in text_features and then in own_words, and encoded if neither has them and there is an
+    encoder; None for all words of text_features or, without it, of own_words; or name -> vector (D,); or a Vocabulary,
+    taken as it is, even if empty. Words of a set are sorted alphabetically.
+    text_features: a text-features file, or the result of ``read_text_features``. own_words, feature_space: the scene's.
+    carried: returns the encoder in the scene's file, if it has one.
+    Raises OgPointcloudError for a word that has no vector or is given twice, FeatureSpaceError for text_features of
+    another space and for vectors that cannot be compared.
     """
-    # In the order in which they are looked up: what the caller gives comes before what the scene stores.
+    # In order of look-up: the caller's words come before the scene's.
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
     if labels is None:
         if not sources:
@@ -55,8 +55,8 @@ def resolve_labels(
     if isinstance(labels, Mapping):
         return _checked([str(name) for name in labels], _stacked(labels, labels.values()))
     if isinstance(labels, np.ndarray):
-        labels = [*np.atleast_1d(labels)]  # one without dimensions is a word
-    if isinstance(labels, (set, frozenset)):  # the order of a set is another one in the next run
+        labels = [*np.atleast_1d(labels)]  # a 0-dimensional array is one word
+    if isinstance(labels, (set, frozenset)):  # the order of a set varies from run to run
         labels = sorted(labels, key=str)
     words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
     for word in words:
@@ -70,7 +70,7 @@ def resolve_labels(
 def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
     if not names:
         raise OgPointcloudError("0 labels are given; expected at least one word: name what you want to find")
-    return checked_vocabulary(tuple(map(str, names)), vectors)  # of numpy's strings too
+    return checked_vocabulary(tuple(map(str, names)), vectors)  # names may be numpy strings
 
 
 def _ways(feature_space: str) -> str:
@@ -91,7 +91,7 @@ def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | N
 
 
 def words_of(text_features: StrPath | tuple[Vocabulary, str]) -> tuple[Vocabulary, str]:
-    """What `read_text_features` returns for a file, or has returned. OgPointcloudError for anything else."""
+    """The result of `read_text_features`, given it or a file's path. OgPointcloudError for anything else."""
     if isinstance(text_features, (str, os.PathLike)):
         return read_text_features(text_features)
     if isinstance(text_features, tuple) and [*map(type, text_features)] == [Vocabulary, str]:
@@ -118,7 +118,7 @@ def _stacked(names: Iterable[str], vectors: Iterable[Any]) -> NDArray[Any]:
 def _looked_up(
     words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, carried: CarriedEncoder | None
 ) -> NDArray[np.float32]:
-    vectors: dict[str, np.ndarray] = {}  # the first source is entered last, and wins
+    vectors: dict[str, np.ndarray] = {}  # the first source is entered last, so it wins
     for source in reversed(sources):
         vectors |= dict(zip(source.names, source.vectors, strict=True))
     missing = [word for word in words if word not in vectors]
@@ -127,8 +127,8 @@ def _looked_up(
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
         hint = did_you_mean(missing[0], vectors, " If not")
-        first = printable(missing[0], LONGEST_WORD)
-        few = not hint and 0 < len(vectors) <= FEW_WORDS
+        first = printable(missing[0], MAX_WORD_CHARACTERS)
+        few = not hint and 0 < len(vectors) <= MAX_LISTED_WORDS
         known = f" ({printable(', '.join(sorted(vectors)), 300)})" if few else ""
         raise OgPointcloudError(
             f"'{first}' is not among the {len(vectors)} known words{known}{others}{hint}: {_ways(feature_space)}"
