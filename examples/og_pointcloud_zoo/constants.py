@@ -53,12 +53,12 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.colors.SURENESS_POWER": ("", ()),
     "fitting.seen_colors.OPEN_IS_SEEN": ("table", ("_believe",)),
     "fitting.held_out.CLEARLY": ("table", ()),
-    "rendering.geometry.TAMED_BY": ("table", ()),
-    "rendering.geometry.SPARSE": ("table", ()),
-    "rendering.geometry.SCATTERED": ("table", ()),
+    "rendering.geometry.SPACING_MEDIAN_NEIGHBORS": ("table", ()),
+    "rendering.geometry.FLOATER_SPACINGS": ("table", ()),
+    "rendering.geometry.FLOATER_SCATTER_SHARE": ("table", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "fitting.association.CLEARLY": ("", ()),
-    "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
+    "rendering.sightings.MIN_OPENNESS": ("table", ("_trace_openness",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
@@ -86,8 +86,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.view_reports.HIDDEN", "fitting.view_reports.LEAST", "fitting.view_reports.ENOUGH",
         "fitting.view_reports.EXPECTED", "fitting.view_reports.UNSEEN", "fitting.view_reports.MORE_LIKELY",
         "fitting.view_reports.SMOOTHNESS", "fitting.view_reports.APART",
-        "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",
-        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS",
+        "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
+        "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
@@ -252,14 +253,14 @@ def _module(path: str) -> tuple[Any, str]:
 def _in_module(path: str, value: Any) -> Iterator[None]:
     """A module's number changed for a while; compiled functions that know it are compiled anew, on no disk."""
     module, name = _module(path)
-    before, samples = getattr(module, name), getattr(module, "SAMPLES", None)
+    before, samples = getattr(module, name), getattr(module, "VOTE_SAMPLES", None)
     try:
         _put(module, name, value, path)
         yield
     finally:
         _put(module, name, before, path)
         if samples is not None:
-            module.SAMPLES = samples
+            module.VOTE_SAMPLES = samples
 
 
 def _put(module: Any, name: str, value: Any, path: str) -> None:
@@ -271,7 +272,7 @@ def _put(module: Any, name: str, value: Any, path: str) -> None:
     if path.startswith("rendering.sightings."):  # where votes are taken follows from two of its numbers
         share, edge = module.RING_SHARE, module.EDGE_PX
         ring = [(edge * np.cos(angle), edge * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
-        module.SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
+        module.VOTE_SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
     for function in MODULES[path][1] if changes else ():
         compiled = getattr(module, function)
         compiled._cache = NullCache()
