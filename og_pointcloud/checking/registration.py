@@ -164,7 +164,7 @@ class Registration:
         camera = self.cameras[view]
         pose, size = camera.world_to_camera, np.array([camera.width, camera.height])
         in_camera = self._moved(self.xyz[rows], numbers) @ pose[:3, :3].T + pose[:3, 3]
-        # Points beside or behind the camera get finite places far outside; lens terms are constant beyond r = 2 (63 degrees).
+        # Points beside or behind the camera get finite places far outside; r is clamped at 2 (63 degrees).
         xy = in_camera[:, :2] / np.maximum(in_camera[:, 2:], 1e-3 * self.depth)
         r2 = np.minimum((xy**2).sum(axis=1), 4.0)[:, None]
         bent = xy * (1 + r2 * (numbers[10] + r2 * numbers[11])) * np.exp(numbers[LOG_FOCAL])
