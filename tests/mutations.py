@@ -407,7 +407,7 @@ MUTATIONS = (
     ),
     Mutation(
         "archives of any ratio", "formats/npy.py",
-        "if total > max(PLENTY, MOST_RATIO * file.stat().st_size):", "if total < 0:",
+        "if total > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * file.stat().st_size):", "if total < 0:",
         trust("a_small_file_does_not_unpack_to_a_large_one"),
     ),
     Mutation(
