@@ -45,7 +45,7 @@ from transformers import CLIPTokenizer
 from og_pointcloud.masking.contracts import LEVELS, ImageModel
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
-from og_pointcloud.masking.levels import settled
+from og_pointcloud.masking.levels import masks_of_level
 from og_pointcloud.masking.opencv import OpenCVProposer
 from og_pointcloud.text.encoder import TextEncoder as TrainedTextEncoder
 from og_pointcloud.text.encoder import read_text_encoder
@@ -141,7 +141,7 @@ def rendered(seeds: Sequence[int], views: int, processes: int) -> Crops:
 def opencv_masks(image: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
     """The masks of all levels of what OpenCV proposes."""
     proposals = OpenCVProposer().propose(image)
-    maps = [settled(proposals, level)[0] for level in LEVELS]
+    maps = [masks_of_level(proposals, level)[0] for level in LEVELS]
     return [ids == number for ids in maps for number in range(ids.max() + 1)]
 
 

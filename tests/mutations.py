@@ -345,12 +345,12 @@ MUTATIONS = (
     ),
     Mutation(
         "ids between ids are believed", "checking/check.py",
-        "MOST_BLENDED = 0.004", "MOST_BLENDED = 2",
+        "MAX_BLENDED_SHARE = 0.004", "MAX_BLENDED_SHARE = 2",
         ("test_checking.py::test_pictures_of_ids_that_were_blended_are_told",),
     ),
     Mutation(
         "a search ends where it is hidden from", "checking/registration.py",
-        "again = self.found(name, small)", "again = small",
+        "again = self.best_change(name, small)", "again = small",
         ("test_checking.py::test_a_large_shift_is_taken_back_whole",),
     ),
     Mutation(
@@ -409,7 +409,7 @@ MUTATIONS = (
     ),
     Mutation(
         "archives of any ratio", "formats/npy.py",
-        "if total > max(PLENTY, MOST_RATIO * file.stat().st_size):", "if total < 0:",
+        "if total > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * file.stat().st_size):", "if total < 0:",
         trust("a_small_file_does_not_unpack_to_a_large_one"),
     ),
     Mutation(

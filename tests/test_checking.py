@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import og_pointcloud as og
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.checking.check import (
-    MOST_BLENDED,
+    MAX_BLENDED_SHARE,
     CaptureWarning,
     _coordinates,
     check_capture,
@@ -26,7 +26,7 @@ from og_pointcloud.checking.check import (
 )
 from og_pointcloud.checking.masks import MaskMaps, _blended, entropies
 from og_pointcloud.checking.photographs import Photographs
-from og_pointcloud.checking.sample import VIEWS, Comparison, draw_sample, seen
+from og_pointcloud.checking.sample import SAMPLE_VIEWS, Comparison, draw_sample, seen
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import SceneError
@@ -87,12 +87,12 @@ def named(scene, names):
 # Right rooms.
 
 
-@pytest.mark.parametrize("count", [VIEWS - 1, 2 * VIEWS])
+@pytest.mark.parametrize("count", [SAMPLE_VIEWS - 1, 2 * SAMPLE_VIEWS])
 def test_of_images_cut_into_faces_the_fronts_are_asked_where_there_are_enough(count):
     room = tiled_room(1, views=1, points=100)
     names = [f"{index:02}/{face}" for index in range(count) for face in ("front", "left", "up")]
     asked = {view.name.split("/")[1] for view in draw_sample(named(room, names)).views}
-    assert (asked == {"front"}) == (count >= VIEWS)
+    assert (asked == {"front"}) == (count >= SAMPLE_VIEWS)
     # Cameras of a rig may be called so too.
     names = [f"{side}/{index:02}" for side in ("front", "left") for index in range(count)]
     assert {view.name.split("/")[0] for view in draw_sample(named(room, names)).views} == {"front", "left"}
@@ -360,10 +360,10 @@ def test_masks_a_pixel_wide_are_no_blended_ids():
     random = np.random.default_rng(0)
     tiles = np.repeat(random.integers(0, 200, (300, 1000)), 8, axis=1)
     tiles[:, ::8] = random.integers(0, 200, (300, 1000))
-    assert abs(_blended(tiles)) < MOST_BLENDED
+    assert abs(_blended(tiles)) < MAX_BLENDED_SHARE
     halves = tiles[:, 1:-1].copy()
     halves[:, 7::8] = (tiles[:, 7:-8:8] + tiles[:, 9::8]) // 2  # of a smoothed picture
-    assert _blended(halves) > 10 * MOST_BLENDED
+    assert _blended(halves) > 10 * MAX_BLENDED_SHARE
 
 
 def test_ids_that_count_from_zero_are_named():

@@ -12,9 +12,9 @@ from scenes import camera, room_poses, sample_surfaces
 import og_pointcloud as og
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import (
-    BEHIND,
-    CELL_POINTS,
-    FEW,
+    DEPTH_RATIO,
+    MAX_RARE_SHARE,
+    POINTS_PER_CELL,
     masks_at,
     needed_views,
     seen_points,
@@ -28,12 +28,12 @@ def reference_seen(xyz: NDArray[np.floating], view: Camera) -> NDArray[np.bool_]
     """(n,) bool, by the definition: inside the image, and not far behind the nearest point of its cell."""
     uv, depth = view.project(xyz)
     inside = (depth > 0) & view.shows(uv)
-    side = np.sqrt(view.width * view.height * CELL_POINTS / max(inside.sum(), 1))
+    side = np.sqrt(view.width * view.height * POINTS_PER_CELL / max(inside.sum(), 1))
     cell = np.floor(uv / side)
     seen = np.zeros(len(xyz), np.bool_)
     for g in np.flatnonzero(inside):
         beside = inside & (cell == cell[g]).all(axis=1)
-        seen[g] = depth[g] <= BEHIND * depth[beside].min()
+        seen[g] = depth[g] <= DEPTH_RATIO * depth[beside].min()
     return seen
 
 
@@ -68,7 +68,7 @@ def test_needed_views_are_found_one_after_the_other(seed: int) -> None:
         rare = [g for g in range(80) if (mask[others, g] >= 0).sum() < enough]
         shows = [np.flatnonzero(mask[view] == one) for one in range(4)]
         most = any(np.isin(points, rare).sum() > len(points) / 2 for points in shows)
-        if len(few) < FEW * seen[view].sum() and not most:
+        if len(few) < MAX_RARE_SHARE * seen[view].sum() and not most:
             stay.remove(view)
     assert 3 <= len(stay) < 12
     np.testing.assert_array_equal(np.flatnonzero(needed_views(seen, mask, order, enough)), sorted(stay))

@@ -195,7 +195,7 @@ def test_nerfstudios_depth_files_are_fused(tmp_path, keys):
 @pytest.mark.parametrize(("most", "fused"), [(COUNT + 1, COUNT), (COUNT, COUNT), (COUNT - 1, -(-COUNT // 2))])
 def test_as_many_depth_images_are_fused_as_may_be(tmp_path, monkeypatch, most, fused):
     nerfstudio(tmp_path)
-    monkeypatch.setattr("og_pointcloud.formats.capture.FUSED_FRAMES", most)
+    monkeypatch.setattr("og_pointcloud.formats.capture.MAX_FUSED_FRAMES", most)
     assert fuse_capture(tmp_path).frames == fused
 
 

@@ -8,7 +8,7 @@ from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, r
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
 from og_pointcloud.formats.fusion import (
-    GRAZING,
+    MAX_SLOPE,
     NOISE_TOLERANCE,
     _Voxels,
     doubtful_depth,
@@ -251,7 +251,7 @@ def test_readings_on_a_surface_are_as_in_words(seed, step, slanted):
 
     def joined(line, k, focal):
         near = [line[j] for j in (k - 1, k + 1) if 0 <= j < len(line) and line[j] > 0]
-        if any(abs(z - line[k]) <= min(z, line[k]) * GRAZING / focal + NOISE_TOLERANCE * noise for z in near):
+        if any(abs(z - line[k]) <= min(z, line[k]) * MAX_SLOPE / focal + NOISE_TOLERANCE * noise for z in near):
             return True
         runs = (line[j : j + 5] for j in range(k - 4, k + 1) if 0 <= j <= len(line) - 5)
         slopes = [np.diff(1 / run) for run in runs if (run > 0).all()]

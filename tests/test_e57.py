@@ -186,8 +186,8 @@ def test_truncated_empty_and_foreign_files_are_one_error_and_stay(tmp_path):
 def test_scans_that_together_claim_too_much(tmp_path, monkeypatch):
     """They may all name the same bytes."""
     write_e57(tmp_path / "a.e57", scans=3)
-    monkeypatch.setattr("og_pointcloud.formats.e57.CHUNK", 10)
-    monkeypatch.setattr("og_pointcloud.formats.e57.MOST_POINTS_PER_BYTE", 700 / (tmp_path / "a.e57").stat().st_size)
+    monkeypatch.setattr("og_pointcloud.formats.e57.POINTS_PER_CHUNK", 10)
+    monkeypatch.setattr("og_pointcloud.formats.e57.MAX_POINTS_PER_BYTE", 700 / (tmp_path / "a.e57").stat().st_size)
     with pytest.raises(SceneError, match="claims 300 points, more than fit"):
         read_points(tmp_path / "a.e57")
 

@@ -31,10 +31,10 @@ def test_preprocessing_is_that_of_the_models_own_processor(family, side):
     image = np.random.default_rng(1).integers(0, 256, (side, side, 3), np.uint8)
     image[: side // 2] = image[: side // 2, :1]  # edges and flat parts, not noise alone
     if family == "clip":
-        processor, colors = transformers.CLIPImageProcessor(), clip.CLIP_COLORS
+        processor, colors = transformers.CLIPImageProcessor(), clip.CLIP_MEAN_STD
     else:
         processor = transformers.SiglipImageProcessor(size={"height": 224, "width": 224}, resample=3)
-        colors = clip.SIGLIP_COLORS
+        colors = clip.SIGLIP_MEAN_STD
     ours = Preprocessing(224, *colors)
     expected = np.asarray(processor(image, return_tensors="np", input_data_format="channels_last")["pixel_values"])
     square = mask_crops(image, np.ones((1, side, side), bool), Crop(), 224)

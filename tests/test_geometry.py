@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from og_pointcloud.rendering import geometry
 from og_pointcloud.rendering.geometry import (
-    FLOATER,
-    TAMED_BY,
-    along_curve,
-    chance_of_place,
+    FLOATER_DRAWN_SPACINGS,
+    SPACING_MEDIAN_NEIGHBORS,
     drawn_spacing,
+    morton_order,
     near_plane,
     nearest_in,
     neighborhood,
+    position_hash,
     sample_of_points,
     strided,
 )
@@ -52,7 +52,7 @@ def test_neighbors_are_those_of_brute_force(random: Generator) -> None:
     np.testing.assert_array_equal(around.index, nearest)
     own = np.take_along_axis(apart, nearest, axis=1)
     three = own[:, :3].mean(axis=1)
-    expected = np.minimum(three, np.median(three[nearest[:, :TAMED_BY]], axis=1))
+    expected = np.minimum(three, np.median(three[nearest[:, :SPACING_MEDIAN_NEIGHBORS]], axis=1))
     np.testing.assert_allclose(around.spacing, expected, rtol=1e-5)
     floor = np.maximum(around.spacing, np.median(three))
     np.testing.assert_array_equal(around.adjoining, own <= SETTINGS.reach * floor[:, None])
@@ -91,7 +91,7 @@ def test_only_points_that_float_far_apart_in_all_directions_are_drawn_small(rand
     around = neighborhood(xyz, SETTINGS)
     drawn = drawn_spacing(xyz, around)
     assert np.median(around.spacing[1664:]) > 3, "they are no neighbors of the floor"
-    assert np.mean(np.isclose(drawn[1664:], FLOATER)) > 0.8, (
+    assert np.mean(np.isclose(drawn[1664:], FLOATER_DRAWN_SPACINGS)) > 0.8, (
         "but for some at their rim, whose neighbors lie to one side"
     )
     np.testing.assert_array_equal(drawn[:1664], around.spacing[:1664])
@@ -122,7 +122,7 @@ def test_only_duplicates() -> None:
 @pytest.mark.parametrize("outlier", [0.5, 1e6])
 def test_what_follows_each_other_along_the_curve_is_near(random: Generator, outlier: float) -> None:
     xyz = np.concatenate([random.uniform(size=(4096, 3)), [[outlier] * 3]]).astype(np.float32)
-    rows = along_curve(xyz)
+    rows = morton_order(xyz)
     np.testing.assert_array_equal(np.sort(rows), np.arange(4097))
     runs = xyz[rows[rows != 4096]].reshape(64, 64, 3)  # of the cube of side 1, cubes of side 1/4 if all were even
     assert np.median(np.ptp(runs, axis=1).max(axis=1)) < 0.5
@@ -131,7 +131,7 @@ def test_what_follows_each_other_along_the_curve_is_near(random: Generator, outl
 
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_points_of_one_place_keep_their_order_along_the_curve(n: int) -> None:
-    np.testing.assert_array_equal(along_curve(np.ones((n, 3), np.float32)), np.arange(n))
+    np.testing.assert_array_equal(morton_order(np.ones((n, 3), np.float32)), np.arange(n))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, 18])
@@ -210,7 +210,7 @@ def test_one_far_outlier_or_one_place_leaves_a_sample_of_points() -> None:
 
 def test_chance_of_place_is_even_and_another_for_each_name() -> None:
     xyz = (np.indices((20, 20, 20)).reshape(3, -1).T * 0.01).astype(np.float32)  # a grid: few bits differ
-    first, second = chance_of_place(xyz, "a"), chance_of_place(xyz, "b")
+    first, second = position_hash(xyz, "a"), position_hash(xyz, "b")
     for chance in (first, second):
         np.testing.assert_allclose(np.histogram(chance, 10, (0, 1))[0], 800, atol=120)
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
@@ -240,7 +240,7 @@ def test_neighbors_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.Mo
     xyz = np.random.default_rng(5).random((300, 3)).astype(np.float32)
     xyz[7] = xyz[200]  # a duplicate: the point itself is not always the first found
     at_once = neighborhood(xyz, GeometrySettings())
-    monkeypatch.setattr(geometry, "ROWS_AT_ONCE", 37)
+    monkeypatch.setattr(geometry, "POINTS_PER_QUERY", 37)
     few = neighborhood(xyz, GeometrySettings())
     for name in ("spacing", "index", "adjoining"):
         np.testing.assert_array_equal(getattr(few, name), getattr(at_once, name))

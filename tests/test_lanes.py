@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.random import Generator
 
-from og_pointcloud.rendering.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
+from og_pointcloud.rendering.lanes import WIDTH, any_of, broadcast, exp2, iota, lane_sum, load, minimum, select, store
 
 
 @njit
@@ -16,9 +16,9 @@ def arithmetic(a, b, out):
         x + y,
         x - y,
         x * y,
-        lesser(x, y),
-        either(x < y, x, y),
-        either((x > y) & (x >= y), ramp(), spread(out[0])),
+        minimum(x, y),
+        select(x < y, x, y),
+        select((x > y) & (x >= y), iota(), broadcast(out[0])),
     )
     for k in range(len(results)):
         store(out, k * WIDTH, results[k])
@@ -31,7 +31,7 @@ def power(a, out):
 
 @njit
 def reduce(a, limit):
-    return total(load(a, 0)), any_of(load(a, 0) > spread(limit))
+    return lane_sum(load(a, 0)), any_of(load(a, 0) > broadcast(limit))
 
 
 def test_operations_are_those_of_numpy(random: Generator) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.levels import INSIDE, PREFERENCE, SAME, VISIBLE, settled
+from og_pointcloud.masking.levels import INSIDE_SHARE, PARTS_WEIGHT, SAME_IOU, VISIBLE_SHARE, masks_of_level
 
 
 def rectangle(top, left, bottom, right, size=(24, 32)):
@@ -21,7 +21,7 @@ def proposals(*pairs):
 
 
 def settle(said: Proposals, level: str):
-    return settled(said, level)[0]
+    return masks_of_level(said, level)[0]
 
 
 def random_proposals(seed, count=25, size=(24, 32)):
@@ -40,7 +40,7 @@ def literal(said: Proposals, preference: float):
     kept: list[int] = []
     for k in order:
         mask = said.masks[k]
-        same = [(mask & said.masks[o]).sum() > SAME * (mask | said.masks[o]).sum() for o in kept]
+        same = [(mask & said.masks[o]).sum() > SAME_IOU * (mask | said.masks[o]).sum() for o in kept]
         if mask.any() and not any(same):
             kept.append(k)
 
@@ -48,7 +48,7 @@ def literal(said: Proposals, preference: float):
         mask = said.masks[k]
         around = [
             o for o in kept
-            if said.masks[o].sum() > mask.sum() and (mask & said.masks[o]).sum() > INSIDE * mask.sum()
+            if said.masks[o].sum() > mask.sum() and (mask & said.masks[o]).sum() > INSIDE_SHARE * mask.sum()
         ]  # fmt: skip
         return min(around, key=lambda o: (said.masks[o].sum(), kept.index(o))) if around else None
 
@@ -72,7 +72,7 @@ def literal(said: Proposals, preference: float):
     for k in reversed(used):
         result[said.masks[k]] = k
     for k in used:
-        if (result == k).sum() < VISIBLE * said.masks[k].sum():
+        if (result == k).sum() < VISIBLE_SHARE * said.masks[k].sum():
             result = np.where(result == k, -1 - len(said), result)
     shown = [k for k in kept if (result == k).any()]
     return sum(((result == k) * (rank + 1) for rank, k in enumerate(shown)), np.full(result.shape, -1))
@@ -81,8 +81,8 @@ def literal(said: Proposals, preference: float):
 @pytest.mark.parametrize("seed", range(12))
 def test_the_literal_reference(seed):
     said = random_proposals(seed)
-    for name in PREFERENCE:
-        assert np.array_equal(settle(said, name), literal(said, PREFERENCE[name])), name
+    for name in PARTS_WEIGHT:
+        assert np.array_equal(settle(said, name), literal(said, PARTS_WEIGHT[name])), name
 
 
 def test_a_box_of_two_halves_on_three_levels():
@@ -127,7 +127,7 @@ def test_the_order_of_proposals_does_not_matter():
     said = random_proposals(3)
     order = np.random.default_rng(0).permutation(len(said))
     shuffled = Proposals(said.masks[order], said.scores[order])
-    for name in PREFERENCE:
+    for name in PARTS_WEIGHT:
         assert np.array_equal(settle(said, name), settle(shuffled, name))
 
 
@@ -139,7 +139,7 @@ def test_a_near_copy_is_one_mask_the_better_scored():
 def test_nothing_and_empty_masks():
     none = Proposals(np.zeros((0, 5, 7), bool), np.zeros(0, np.float32))
     empty = Proposals(np.zeros((2, 5, 7), bool), np.ones(2, np.float32))
-    for name in PREFERENCE:
+    for name in PARTS_WEIGHT:
         for said in (none, empty):
             assert np.array_equal(settle(said, name), np.full((5, 7), -1))
 

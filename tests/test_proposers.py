@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.automatic import AutomaticMasks, best_of_alike, grid, stability, without_specks
+from og_pointcloud.masking.automatic import AutomaticMasks, grid, stability, suppress_duplicates, without_specks
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
@@ -57,7 +57,7 @@ def test_the_tree_is_a_tree_and_runs_are_its_regions():
     assert m == 2 * n - 1
     assert (tree.parent < 0).sum() == 1
     assert (tree.parent[:-1] > np.arange(m - 1)).all()
-    assert (tree.gone >= tree.made).all()
+    assert (tree.death >= tree.birth).all()
     place, runs = tree.runs()
     rank = place[tree.superpixels]
     inside: list[set[int]] = [{k} for k in range(n)] + [set() for _ in range(m - n)]
@@ -129,8 +129,8 @@ def test_suppression_against_loops(seed):
     for k in sorted(range(60), key=lambda k: -scores[k]):  # rectangles: a mask is its box
         if all(iou(masks[o], masks[k]) <= 0.3 for o in kept):
             kept.append(k)
-    assert best_of_alike(masks, scores, 0.3).tolist() == kept
-    assert len(best_of_alike(masks[:0], scores[:0], 0.3)) == 0
+    assert suppress_duplicates(masks, scores, 0.3).tolist() == kept
+    assert len(suppress_duplicates(masks[:0], scores[:0], 0.3)) == 0
 
 
 def test_stability_by_hand():

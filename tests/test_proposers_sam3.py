@@ -88,7 +88,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def trusting(monkeypatch):
     """Every detection counts: weights are random."""
-    monkeypatch.setattr(sam3, "LEAST_SCORE", 0.0)
+    monkeypatch.setattr(sam3, "MIN_SCORE", 0.0)
 
 
 def padded(proposer, to=12):

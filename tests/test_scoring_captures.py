@@ -138,7 +138,7 @@ def test_draws_in_parts_are_draws(monkeypatch):
     right = np.random.default_rng(1).random(60) < 0.7
     arguments = (np.where(right, 0, -1), truth_of(np.zeros(60, int)), far_apart(60), 1.0, (0,))
     whole = miou_interval(*arguments)
-    monkeypatch.setattr(intervals, "CHUNK", 600)
+    monkeypatch.setattr(intervals, "NUMBERS_PER_CHUNK", 600)
     assert miou_interval(*arguments) == whole
 
 

@@ -11,9 +11,9 @@ from reference_splatting import in_camera, reference_alpha
 
 from og_pointcloud.rendering.sightings import (
     EDGE_PX,
-    LEAST_OPEN,
+    MIN_OPENNESS,
     RING_SHARE,
-    SAMPLES,
+    VOTE_SAMPLES,
     openness,
     sightings,
     sightings_of,
@@ -49,7 +49,7 @@ def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.
             if NEAR < depth[h] < np.float32(depth[g]) - np.float32(thickness[g]):
                 alpha = alphas[h][int(v), int(u)]
                 light *= 1 - alpha if alpha >= 1 / 255 else 1.0
-        found[g] = light if light >= LEAST_OPEN else 0.0
+        found[g] = light if light >= MIN_OPENNESS else 0.0
     return found
 
 
@@ -166,7 +166,7 @@ def test_votes_are_those_of_every_sample_one_by_one(size: tuple[int, int]) -> No
     for g in np.flatnonzero(open_):
         if ids[min(int(v[g]), size[0] - 1), min(int(u[g]), size[1] - 1)] == NOT_SEEN:
             continue
-        for right, down, share in SAMPLES:
+        for right, down, share in VOTE_SAMPLES:
             x = int(np.clip(np.floor(u[g] + right), 0, size[1] - 1))
             y = int(np.clip(np.floor(v[g] + down), 0, size[0] - 1))
             expected[max(ids[y, x], -1), g] += np.float64(open_[g]) * share

@@ -13,7 +13,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.capture import read_geometry, read_poses
 from og_pointcloud.formats.poses import upright_axes
-from og_pointcloud.formats.structure_from_motion import ALL_PAIRS, NEIGHBORS, _pairs, find_poses
+from og_pointcloud.formats.structure_from_motion import MAX_EXHAUSTIVE, NEIGHBORS, _pairs, find_poses
 
 SIZE = 320, 240
 VIEWS = 9
@@ -133,15 +133,15 @@ def test_too_few_photographs_and_a_missing_library(tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["images"]
 
 
-@pytest.mark.parametrize("count", [3, ALL_PAIRS, ALL_PAIRS + 1, 1000])
+@pytest.mark.parametrize("count", [3, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1, 1000])
 def test_pairs(count):
     pairs = _pairs(count)
     assert len(set(pairs)) == len(pairs)
     assert all(0 <= a < b < count for a, b in pairs)
     near = {(a, b) for a in range(count) for b in range(a + 1, min(a + 1 + NEIGHBORS, count))}
     assert near <= set(pairs)
-    assert len(pairs) <= ALL_PAIRS**2 / 2 + count * NEIGHBORS
-    if count <= ALL_PAIRS:
+    assert len(pairs) <= MAX_EXHAUSTIVE**2 / 2 + count * NEIGHBORS
+    if count <= MAX_EXHAUSTIVE:
         assert len(pairs) == count * (count - 1) // 2
     assert any(b - a > count // 2 for a, b in pairs), "the ends are compared too: loops close"
 

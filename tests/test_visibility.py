@@ -171,8 +171,8 @@ def test_splats_that_are_passed_over_would_show_in_no_pixel(off_axis: float):
     seen_by = view.world_to_camera, intrinsics, (view.width, view.height), NEAR
     splats, area = splatting._records(n), np.zeros(n)
     shows = splatting._project(np.arange(n), shapes, seen_by, Cutoffs(), splats, area) != splatting.CULLED
-    borders = splatting._borders(seen_by, Cutoffs())
-    looked_at = splatting._may_show(*shapes[:2], splatting._boxes(*shapes[:2]), borders)
+    borders = splatting._frustum_planes(seen_by, Cutoffs())
+    looked_at = splatting._in_frustum(*shapes[:2], splatting._boxes(*shapes[:2]), borders)
     assert shows.sum() > 500
     assert looked_at[shows].all()
     assert looked_at.sum() < shows.sum() + 0.5 * (~shows).sum()

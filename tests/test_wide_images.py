@@ -107,7 +107,7 @@ def test_a_mask_across_a_border_of_faces_is_one_mask_of_each(panoramas):
 
 
 def test_the_masks_of_an_image_are_read_once_for_all_its_faces(panoramas, monkeypatch):
-    monkeypatch.setattr(capture, "DECODED", 1)
+    monkeypatch.setattr(capture, "DECODED_MAPS", 1)
     scene = read_capture(panoramas)
     maps = [view.mask_map() for view in scene.views]
     shutil.rmtree(panoramas / "masks")

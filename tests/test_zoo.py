@@ -267,13 +267,13 @@ def test_a_number_of_a_module_is_changed_for_a_while_in_compiled_code_too():
 
 
 def test_the_ring_of_votes_follows_its_numbers():
-    before = sightings.SAMPLES.copy()
+    before = sightings.VOTE_SAMPLES.copy()
     with numbers._in_module("rendering.sightings.RING_SHARE", 0.25):
-        assert sightings.SAMPLES[:, 2].sum() == pytest.approx(1)
-        assert sightings.SAMPLES[0, 2] == 0.75
-    np.testing.assert_array_equal(sightings.SAMPLES, before)
+        assert sightings.VOTE_SAMPLES[:, 2].sum() == pytest.approx(1)
+        assert sightings.VOTE_SAMPLES[0, 2] == 0.75
+    np.testing.assert_array_equal(sightings.VOTE_SAMPLES, before)
     with numbers._in_module("rendering.sightings.EDGE_PX", sightings.EDGE_PX):  # as it stands: the same ring
-        np.testing.assert_allclose(sightings.SAMPLES, before)
+        np.testing.assert_allclose(sightings.VOTE_SAMPLES, before)
 
 
 def test_verdicts_of_numbers(tmp_path):

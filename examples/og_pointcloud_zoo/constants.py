@@ -53,12 +53,12 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.colors.SURENESS_POWER": ("", ()),
     "fitting.seen_colors.SEEN_PRIOR": ("table", ("_apply_color_evidence",)),
     "fitting.held_out.MIN_AGREEMENT_GAIN": ("table", ()),
-    "rendering.geometry.TAMED_BY": ("table", ()),
-    "rendering.geometry.SPARSE": ("table", ()),
-    "rendering.geometry.SCATTERED": ("table", ()),
+    "rendering.geometry.SPACING_MEDIAN_NEIGHBORS": ("table", ()),
+    "rendering.geometry.FLOATER_SPACINGS": ("table", ()),
+    "rendering.geometry.FLOATER_SCATTER_SHARE": ("table", ()),
     "fitting.looks.MIN_LOOK_MASKS": ("", ()),
     "fitting.association.DOMINANT_WEIGHT_RATIO": ("", ()),
-    "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
+    "rendering.sightings.MIN_OPENNESS": ("table", ("_trace_openness",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
@@ -87,8 +87,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.view_reports.MAX_INDEPENDENT_VIEWS", "fitting.view_reports.PRIOR_COUNT",
         "fitting.view_reports.NO_MASK_LOG_PENALTY", "fitting.view_reports.BACKGROUND_LOG_PRIOR",
         "fitting.view_reports.SMOOTHNESS", "fitting.view_reports.MIN_COLOR_RATIO",
-        "rendering.geometry.TAMED_BY", "rendering.geometry.SPARSE", "rendering.geometry.SCATTERED",
-        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS", "rendering.geometry.FLOATER_SCATTER_SHARE",
+        "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
@@ -253,14 +253,14 @@ def _module(path: str) -> tuple[Any, str]:
 def _in_module(path: str, value: Any) -> Iterator[None]:
     """A module's number changed for a while; compiled functions that know it are compiled anew, on no disk."""
     module, name = _module(path)
-    before, samples = getattr(module, name), getattr(module, "SAMPLES", None)
+    before, samples = getattr(module, name), getattr(module, "VOTE_SAMPLES", None)
     try:
         _put(module, name, value, path)
         yield
     finally:
         _put(module, name, before, path)
         if samples is not None:
-            module.SAMPLES = samples
+            module.VOTE_SAMPLES = samples
 
 
 def _put(module: Any, name: str, value: Any, path: str) -> None:
@@ -272,7 +272,7 @@ def _put(module: Any, name: str, value: Any, path: str) -> None:
     if path.startswith("rendering.sightings."):  # where votes are taken follows from two of its numbers
         share, edge = module.RING_SHARE, module.EDGE_PX
         ring = [(edge * np.cos(angle), edge * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
-        module.SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
+        module.VOTE_SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
     for function in MODULES[path][1] if changes else ():
         compiled = getattr(module, function)
         compiled._cache = NullCache()

@@ -1,1 +1,1 @@
-"""Whether a capture fits together: poses, photographs, masks, features, cloud. Asked before a fit is believed."""
+"""Whether a capture fits together: poses, photographs, masks, features, cloud. Checked before a fit is believed."""

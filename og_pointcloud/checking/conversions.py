@@ -1,8 +1,8 @@
 """Which of the usual conversions makes a capture fit: axes, direction, units, scale, intrinsics, neighboring frames.
 
-All repairs that `KINDS` lists are tried on few views and points, and the best of them again on all that were read. One
-is named only if it fits well, and far better than what the files say. Numbers (a scale, a focal length) are searched on
-a grid, then more finely. Where none fits, each is tried again after one of the commonest mistakes was repaired.
+All repairs that `KINDS` lists are tried on few views and points, and the best of them again on all that were read. A
+repair is named only if it fits well, and far better than the files as they are. Numbers (a scale, a focal length) are
+searched on a grid, then refined. Where none fits, each is tried again after repairing one of the commonest mistakes.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ import numpy as np
 
 from og_pointcloud.checking.masks import MaskMaps
 from og_pointcloud.checking.photographs import Photographs
-from og_pointcloud.checking.registration import MORE_POINTS, Registration
+from og_pointcloud.checking.registration import MORE_POINTS_PER_VIEW, Registration
 from og_pointcloud.checking.sample import Comparison
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.repairs import KINDS, MASK_FLIPS, MASK_SHIFTS, Repair
 
 Repairs = tuple[Repair, ...]
 
-COMMONEST = "axes=flipped", "direction=inverse", "scale=1000", "scale=0.001", "frames=1", "frames=-1"
-"""Mistakes that are made together with a second one."""
+COMMON_MISTAKES = "axes=flipped", "direction=inverse", "scale=1000", "scale=0.001", "frames=1", "frames=-1"
+"""Mistakes that often come with a second one."""
 FINALISTS = 8
 """How many of the best on few views and points are tried again on all."""
 PHOTOGRAPHS_FIT, MASKS_FIT = (0.8, 0.4), (0.9, 0.18)
-"""Share and gap (`Comparison`) from which a conversion fits."""
-FEWEST_COMPARED = 30
-"""Fewer comparisons of masks than this convince nobody."""
-BETTER = 0.1
-"""By how much a conversion's gap must exceed that of what the files say."""
+"""Least share and gap (`Comparison`) of a conversion that fits."""
+MIN_COMPARISONS = 30
+"""Fewer comparisons of masks are not convincing."""
+MIN_GAP_GAIN = 0.1
+"""By how much a conversion's gap must exceed that of the files as they are."""
 STEPS_PER_DOUBLING = 8
-"""A grid this fine brings the drawing to within a cell or two."""
+"""Fine enough to bring the rendering to within a cell or two."""
 ROUND_NUMBERS = (1000, 100, 10, 8, 4, 3, 2, 1.5, 1 / 0.3048, 2.54, 1)
 """Factors that units (millimeters, centimeters, feet, inches) and reduced images are off by."""
-ROUND = 0.015
-"""A number within this share of a round one, or of its reciprocal, is the round one, if that fits as well."""
-CLOSE = 1.1
-"""Up to this many times the least error counts as fitting as well."""
+ROUND_TOLERANCE = 0.015
+"""A number within this share of a round one, or of its reciprocal, is replaced by it, if that fits as well."""
+MAX_ERROR_RATIO = 1.1
+"""An error up to this many times the least counts as fitting as well."""
 
 
 def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
@@ -46,15 +46,15 @@ def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     single = _best_of(evidence, _tried())
     if single or isinstance(evidence, MaskMaps):
         return single
-    # Neither a word nor one number: first a small motion of all cameras, then two mistakes at once.
-    registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
-    moved = registration.repair("aligned", registration.refined("aligned", registration.found("aligned")))
+    # No single word or number fits: try a small motion of all cameras, then two mistakes at once.
+    registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS_PER_VIEW)
+    moved = registration.repair("aligned", registration.refined("aligned", registration.best_change("aligned")))
     return moved if _convinces(evidence, moved) else _best_of(evidence, _pairs())
 
 
 def _best_of(evidence: Photographs | MaskMaps, tried: Iterable[Repairs]) -> Repairs:
     """The best of the tried repairs, if it convinces; else ()."""
-    # Hundreds are tried, so first on a small part of the evidence; by the gap, as several may win every comparison.
+    # Hundreds are tried, so first on little evidence; ranked by gap, as several may win every comparison.
     few = evidence.fewer()
     finalists = sorted(tried, key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
     best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)
@@ -68,15 +68,15 @@ def best_mask_conversion(maps: MaskMaps) -> Repairs:
     fits: dict[Repairs, Comparison] = {}
     for value, flip in MASK_FLIPS.items():
         fits[_parsed(f"masks={value}")] = replace(maps, ids=[flip(ids) for ids in maps.ids]).fit(cameras)
-    for value, by in MASK_SHIFTS.items():  # with the neighbor's camera, these masks tell the same
+    for value, by in MASK_SHIFTS.items():  # equivalent to giving these masks the neighbor's camera
         fits[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
     best = max(fits, key=lambda repairs: fits[repairs].gap)
-    better = fits[best].gap > maps.fit(cameras).gap + BETTER / 2  # masks stand out half as far: MASKS_FIT
-    return best if better and fits[best].compared >= FEWEST_COMPARED and fits[best].reaches(MASKS_FIT) else ()
+    better = fits[best].gap > maps.fit(cameras).gap + MIN_GAP_GAIN / 2  # the gaps of masks are half as large: MASKS_FIT
+    return best if better and fits[best].compared >= MIN_COMPARISONS and fits[best].reaches(MASKS_FIT) else ()
 
 
 def _tried() -> Iterable[Repairs]:
-    """Every repair of cameras that is one word or one number, and both mistakes of axes at once."""
+    """Every repair of cameras by one word or one number, and both mistakes of axes at once."""
     flipped, inverse = "axes=flipped", "direction=inverse"
     for name, kind in KINDS.items():
         if name not in ("masks", "lens"):
@@ -88,7 +88,7 @@ def _tried() -> Iterable[Repairs]:
 
 def _pairs() -> Iterable[Repairs]:
     """Every repair after one of the commonest. Two of different kinds are nearly the same in either order."""
-    for first in map(_parsed, COMMONEST):
+    for first in map(_parsed, COMMON_MISTAKES):
         yield from (first + repairs for repairs in _tried() if repairs[0].name != first[0].name)
 
 
@@ -97,7 +97,7 @@ def _parsed(words: str) -> Repairs:
 
 
 def _fit(evidence: Photographs | MaskMaps, repairs: Repairs) -> Comparison:
-    """With the cameras as the repairs mean them; of nothing where that makes no sense."""
+    """The fit with the cameras repaired; an empty comparison where the repairs make no sense."""
     try:
         return evidence.fit(evidence.sample.repaired(repairs))
     except SceneError:
@@ -105,7 +105,7 @@ def _fit(evidence: Photographs | MaskMaps, repairs: Repairs) -> Comparison:
 
 
 def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
-    """The number of the last repair, searched more finely, and made a round one where that fits as well."""
+    """The repairs with the last one's number refined, and rounded where that fits as well."""
     *before, repair = repairs
     if not KINDS[repair.name].doublings:
         return repairs
@@ -114,11 +114,11 @@ def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
         return 1 - _fit(photographs, (*before, *_parsed(f"{repair.name}={value:.6g}"))).own
 
     value = repair.numbers[0]
-    # Thrice around the best so far, from the grid's step (9%) down to a twentieth of a percent.
+    # Three searches around the best so far, from the grid's step (9%) down to a twentieth of a percent.
     for width, count in ((0.06, 6), (0.01, 5), (0.002, 4)):
         value = float(min(value * (1 + width * np.linspace(-1, 1, 2 * count + 1)), key=error))
     for round_one in (number**sign for number in ROUND_NUMBERS for sign in (1, -1)):
-        if abs(value / round_one - 1) < ROUND and error(round_one) <= CLOSE * error(value):
+        if abs(value / round_one - 1) < ROUND_TOLERANCE and error(round_one) <= MAX_ERROR_RATIO * error(value):
             value = round_one
             break
     return (*before, *_parsed(f"{repair.name}={value:.5g}"))
@@ -127,5 +127,5 @@ def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
 def _convinces(evidence: Photographs | MaskMaps, repairs: Repairs) -> bool:
     stated, found = _fit(evidence, ()), _fit(evidence, repairs)
     enough = PHOTOGRAPHS_FIT if isinstance(evidence, Photographs) else MASKS_FIT
-    few = isinstance(evidence, MaskMaps) and found.compared < FEWEST_COMPARED
-    return not few and found.reaches(enough) and found.gap > stated.gap + BETTER
+    few = isinstance(evidence, MaskMaps) and found.compared < MIN_COMPARISONS
+    return not few and found.reaches(enough) and found.gap > stated.gap + MIN_GAP_GAIN

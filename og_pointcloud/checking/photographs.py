@@ -1,7 +1,7 @@
-"""Does the drawing of view i fit photograph i better than other photographs?
+"""Does the rendering of view i fit photograph i better than other photographs?
 
-The points' colors are drawn where the poses say, on a grid of some dozen cells a side, and correlated with the
-photographs on that grid. So coarse a photograph tells little but where things are, which wrong poses get wrong; another
+The points' colors are rendered at the stated poses, on a grid of some dozen cells a side, and correlated with the
+photographs on that grid. So coarse a photograph shows little but where things are, which wrong poses get wrong; another
 exposure, noise and hidden points change little. Nothing else of the capture is used.
 """
 
@@ -21,26 +21,26 @@ from og_pointcloud.scene import Camera, View
 
 Floats = NDArray[np.float32]
 
-LONGEST_PX = 192
+MAX_SIDE_PX = 192
 FEW_VIEWS, FEW_POINTS = 4, 3000
-FEWEST_CELLS = 30
-"""A drawing of fewer cells says nothing."""
-SOME_BLACK = 0.02
+MIN_CELLS = 30
+"""A rendering with fewer cells is no evidence."""
+MAX_BLACK_SHARE = 0.02
 """A pixel of a reduced image shows nothing when more than this share of it is black, as beyond a lens's rim."""
-FLAT = 3.0
+MIN_COLOR_DEVIATION = 3.0
 """Standard deviation of colors, of 255, below which there is nothing to compare."""
-ALIKE = 0.95
-"""Photographs that correlate at least this much show the same: either may fit the other's drawing as well."""
-FEWEST_COMPARED = 3
-GREY = 3.0
-"""Mean difference between the channels, of 255, up to which colors are no colors: a LiDAR's intensity, say."""
-FEW_COLORS = 64
-"""A cloud colored by classes has no more."""
+SAME_CONTENT_CORRELATION = 0.95
+"""Photographs that correlate at least this much show the same: either may fit the other's rendering as well."""
+MIN_COMPARISONS = 3
+MAX_GRAY_TINT = 3.0
+"""Mean range of the channels, of 255, below which colors are gray: a LiDAR's intensity, say."""
+MAX_CLASS_COLORS = 64
+"""A cloud colored by class has at most this many colors."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """sample: the views of the scene that have photographs. images: (H, W, 3) each, LONGEST_PX along the longer side,
+    """sample: the views of the scene that have photographs. images: (H, W, 3) each, MAX_SIDE_PX along the longer side,
     NaN where nothing is shown. grids: for each view (1 + rivals, cells, 3), its photograph on the grid of `seen`, then
     the rivals on the same grid: its own mirrored, and others that do not show the same."""
 
@@ -49,12 +49,12 @@ class Photographs:
     grids: list[Floats]
 
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
-        """How much better each drawing by these cameras fits its own photograph than the rivals."""
+        """How much better each rendering by these cameras fits its own photograph than the rivals."""
         assert self.sample.rgb is not None
         pairs = []
         for camera, grid in zip(cameras, self.grids, strict=True):
             drawing, cells = _drawing(seen(self.sample.xyz, camera), self.sample.rgb)
-            own, *others = _correlations(drawing, grid[:, cells])  # all over the same cells, which the drawing has
+            own, *others = _correlations(drawing, grid[:, cells])  # all over the same cells, those of the rendering
             pairs += [(own, other) for other in others]
         return Comparison.of(pairs, "correlation", of_rest=True)
 
@@ -66,17 +66,17 @@ class Photographs:
 
     @property
     def points_are_painted(self) -> bool:
-        """Whether the points' colors may be none of photographs: gray where the photographs are not, or only a few
-        different ones, as of classes."""
+        """Whether the points' colors may not come from photographs: gray where the photographs are not, or only a few
+        distinct ones, as for classes."""
         rgb = self.sample.rgb
-        if rgb is None or len(np.unique(rgb, axis=0)) <= FEW_COLORS:
+        if rgb is None or len(np.unique(rgb, axis=0)) <= MAX_CLASS_COLORS:
             return True
-        return _tint(rgb) < GREY <= float(np.median([_tint(grid[0]) for grid in self.grids]))
+        return _tint(rgb) < MAX_GRAY_TINT <= float(np.median([_tint(grid[0]) for grid in self.grids]))
 
 
 def read_photographs(sample: Sample) -> Photographs | None:
     """None where there is nothing to compare: no photographs, no colors, or a few photographs of the same."""
-    if sample.rgb is None or float(sample.rgb.std(axis=0).max()) < FLAT:
+    if sample.rgb is None or float(sample.rgb.std(axis=0).max()) < MIN_COLOR_DEVIATION:
         return None
     readable = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
     images = list(readable.values())
@@ -84,13 +84,13 @@ def read_photographs(sample: Sample) -> Photographs | None:
     shapes = [grid_shape(camera) for camera in sample.cameras]
     small = [_resized(image, columns, rows) for image, (rows, columns) in zip(images, shapes, strict=True)]
     grids = [_with_rivals(grid, small) for grid in small]
-    if sum(len(grid) - 1 for grid in grids) < FEWEST_COMPARED:
+    if sum(len(grid) - 1 for grid in grids) < MIN_COMPARISONS:
         return None
     return Photographs(sample, images, grids)
 
 
 def unreadable(views: Iterable[View]) -> list[str]:
-    """What is wrong with each photograph of these views that cannot be used."""
+    """The error of each photograph of these views that cannot be read."""
     found = []
     for view in views:
         try:
@@ -119,11 +119,11 @@ def _small_image(view: View) -> Floats | None:
         return None
     if image is None:
         return None
-    small = shrunk(image, LONGEST_PX)
-    if float(small.std()) < FLAT:
+    small = shrunk(image, MAX_SIDE_PX)
+    if float(small.std()) < MIN_COLOR_DEVIATION:
         return None
     black = require_cv2().inRange(image, (0, 0, 0), (0, 0, 0))  # 255 where it is
-    small[shrunk(black, LONGEST_PX) > 255 * SOME_BLACK] = np.nan
+    small[shrunk(black, MAX_SIDE_PX) > 255 * MAX_BLACK_SHARE] = np.nan
     return small
 
 
@@ -141,7 +141,7 @@ def _with_rivals(grid: Floats, grids: list[Floats]) -> Floats:
     rows, columns = grid.shape[:2]
     others = [require_cv2().resize(other, (columns, rows)) for other in grids if other is not grid]
     candidates = np.stack([grid, grid[:, ::-1], *others]).reshape(-1, rows * columns, 3)
-    alike = _correlations(candidates[0], candidates) >= ALIKE
+    alike = _correlations(candidates[0], candidates) >= SAME_CONTENT_CORRELATION
     return candidates[np.r_[True, ~alike[1:]]]
 
 
@@ -150,9 +150,9 @@ def _correlations(drawing: Floats, photographs: Floats) -> Floats:
     is shown."""
     shown = np.asarray(np.isfinite(photographs).all(axis=2, keepdims=True))
     a, b = centered(drawing[None], shown), centered(np.where(shown, photographs, 0), shown)
-    # 1e-6 keeps an even drawing or photograph, which has no length, from dividing by 0.
+    # 1e-6 keeps a uniform rendering or photograph, of length 0, from dividing by 0.
     size = np.sqrt((a * a).sum(axis=(1, 2)) * (b * b).sum(axis=(1, 2)) + 1e-6)
-    return np.where(shown.sum(axis=(1, 2)) < FEWEST_CELLS, 0, (a * b).sum(axis=(1, 2)) / size)
+    return np.where(shown.sum(axis=(1, 2)) < MIN_CELLS, 0, (a * b).sum(axis=(1, 2)) / size)
 
 
 def centered(colors: NDArray[Any], shown: NDArray[np.bool_]) -> NDArray[Any]:

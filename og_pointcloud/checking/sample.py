@@ -1,4 +1,4 @@
-"""What the checks look at: some views and points of a scene, which points a camera sees, and how comparisons count."""
+"""What the checks use: a sample of views and points, the points that a camera sees, and how comparisons are scored."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
 from og_pointcloud.scene import Camera, Scene, View
 
-VIEWS = 12
-POINTS = 20_000
-CELLS = 48
-"""Cells along an image's longer side; the nearest point of each hides those behind it. A few must fall into each."""
-BEHIND = 1.1
-"""Points at most so many times as deep as the nearest one of their cell are seen."""
+SAMPLE_VIEWS = 12
+SAMPLE_POINTS = 20_000
+CELLS_PER_SIDE = 48
+"""Cells along an image's longer side, each holding a few points; its nearest point hides those behind it."""
+MAX_DEPTH_RATIO = 1.1
+"""Points at most this many times as deep as the nearest one of their cell are seen."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What should fit, against rivals that should not.
+    """How what should fit compares with rivals that should not.
 
-    share: of the comparisons, those that it wins; ties count half. own, other: mean of its own values and of the
-    rivals'. gap: how far it stands out, own - other or as a share of 1 - other. compared: number of comparisons. unit:
-    what is compared, in a word. error: standard error of the gap, 0 where no groups were given.
+    share: of the comparisons that it wins; ties count half. own, other: mean of its values and of the rivals'. gap: own
+    - other, or that as a share of 1 - other. compared: number of comparisons. unit: the quantity compared, in a word.
+    error: standard error of the gap, 0 where no groups were given.
     """
 
     share: float
@@ -43,7 +43,7 @@ class Comparison:
         cls, pairs: Sequence[tuple[float, float]], unit: str, *, of_rest: bool = False, groups: Sequence[int] = ()
     ) -> Comparison:
         """pairs: (own value, rival's value). of_rest: the gap is a share of 1 - other, what the rivals leave. groups: a
-        number a pair, equal for pairs that are not independent; the gap's error is worked out from them."""
+        number per pair, equal for pairs that are not independent; the gap's error is computed from them."""
         if not pairs:
             return cls(0.0, 0.0, 0.0, 0.0, 0, unit)
         own, other = np.array(pairs).T
@@ -61,7 +61,7 @@ class Comparison:
 
 
 def _clustered_error(values: NDArray[np.float64], groups: Sequence[int]) -> float:
-    """Standard error of the mean of values (n,), those of one group not being independent (Liang and Zeger 1986:
+    """Standard error of the mean of values (n,) that are dependent within a group (Liang and Zeger 1986:
     residuals are summed in each group, then squared); infinite for a single group."""
     _, group = np.unique(groups, return_inverse=True)
     sums = np.bincount(group, weights=values - values.mean())
@@ -83,15 +83,15 @@ class Sample:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras of the views, as the files say."""
+        """The cameras of the views, as the files state them."""
         return [view.camera for view in self.views]
 
     def repaired(self, repairs: Sequence[Repair]) -> list[Camera]:
-        """The cameras of the views as the repairs mean them; a matrix or lengths without sense raise SceneError."""
+        """The cameras of the views with the repairs applied; a senseless matrix or length raises SceneError."""
         # Some repairs depend on all cameras of the scene, as a change of neighboring frames or about their mean does.
         of_all = any(KINDS[repair.name].of_all for repair in repairs)
-        asked = range(len(self.listed)) if of_all else self.places
-        world = [in_local_frame(self.listed[place], -self.origin) for place in asked]
+        needed = range(len(self.listed)) if of_all else self.places
+        world = [in_local_frame(self.listed[place], -self.origin) for place in needed]
         repaired = [in_local_frame(camera, self.origin) for camera in repaired_cameras(world, repairs)]
         return [repaired[place] for place in self.places] if of_all else repaired
 
@@ -120,29 +120,29 @@ class Seen:
 
 def draw_sample(scene: Scene) -> Sample:
     """Some views and points of a scene. Nothing is read."""
-    # Faces of images share few points, and most show few things: of enough images the fronts alone are asked.
+    # Faces of one image share few points, and most show few things: with enough images only the fronts are used.
     names = [view.name for view in scene.views]
     images = [name.removesuffix("front") for name in names if name.endswith("/front")]
     beside = {image + face for image in images for face in CUBE if face != "front"}
     ahead = [row for row, name in enumerate(names) if name not in beside]
-    order = sorted(ahead if len(ahead) >= VIEWS else range(len(names)), key=names.__getitem__)
-    spread = np.unique(np.linspace(0, len(order) - 1, min(VIEWS, len(order))).round().astype(int))
+    order = sorted(ahead if len(ahead) >= SAMPLE_VIEWS else range(len(names)), key=names.__getitem__)
+    spread = np.unique(np.linspace(0, len(order) - 1, min(SAMPLE_VIEWS, len(order))).round().astype(int))
     places = tuple(order[row] for row in spread)
     cameras = tuple(view.camera for view in scene.views)
     views, points = tuple(scene.views[place] for place in places), scene.points
-    step = 1 + (len(points) - 1) // POINTS
+    step = 1 + (len(points) - 1) // SAMPLE_POINTS
     rgb = None if points.rgb is None else points.rgb[::step].astype(np.float32)
     return Sample(points.xyz[::step].astype(np.float64), rgb, views, places, cameras, points.origin)
 
 
-def grid_shape(camera: Camera, cells: int = CELLS) -> tuple[int, int]:
+def grid_shape(camera: Camera, cells: int = CELLS_PER_SIDE) -> tuple[int, int]:
     """Rows and columns of a grid over the image with ``cells`` cells along the longer side."""
     longest = max(camera.width, camera.height)
     return max(1, round(cells * camera.height / longest)), max(1, round(cells * camera.width / longest))
 
 
-def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS) -> Seen:
-    """The points (n, 3) that are in the image and not far behind the nearest one of their cell."""
+def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS_PER_SIDE) -> Seen:
+    """The points (n, 3) that are in the image and not far behind the nearest point of their cell."""
     rows, columns = grid_shape(camera, cells)
     uv_px, depth = camera.project(xyz)
     inside = np.flatnonzero(camera.shows(uv_px))
@@ -152,5 +152,5 @@ def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS) -> Seen:
     # A coarse z-buffer: a hidden point would be compared with what hides it.
     nearest = np.full(columns * rows, np.inf)
     np.minimum.at(nearest, cell, depth[inside])
-    front = depth[inside] <= BEHIND * nearest[cell]
+    front = depth[inside] <= MAX_DEPTH_RATIO * nearest[cell]
     return Seen(inside[front], places[front], cell[front], (rows, columns))

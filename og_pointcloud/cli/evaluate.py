@@ -202,19 +202,19 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     import numpy as np
 
     from og_pointcloud.evaluate.intervals import bootstrap
-    from og_pointcloud.evaluate.lerf import IOU_FOUND, PUBLISHED_PAIRS, WAYS, score_scenes
+    from og_pointcloud.evaluate.lerf import MIN_IOU, PUBLISHED_PAIRS, WAYS, score_scenes
 
     ious = {way: {name: np.array([pair.iou[way] for pair in pairs]) for name, pairs in scenes.items()} for way in WAYS}
     means = {way: score_scenes(of_way) for way, of_way in ious.items()}
     rows = []
     for name, pairs in scenes.items():
         # A scene whose labels name no object has no pair, and no mean.
-        cells = [(of[name].mean(), (of[name] > IOU_FOUND).mean()) if pairs else (None, None) for of in ious.values()]
+        cells = [(of[name].mean(), (of[name] > MIN_IOU).mean()) if pairs else (None, None) for of in ious.values()]
         rows.append((name, str(len(pairs)), *(percent(value) for cell in cells for value in cell)))
     total = sum(map(len, scenes.values()))
     rows.append(("mean", str(total), *(percent(value) for mean in means.values() for value in mean)))
     pooled = [np.concatenate(list(of_way.values())) for of_way in ious.values()]
-    intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
+    intervals = [bootstrap(column) for every in pooled for column in (every, (every > MIN_IOU).astype(float))]
     rows.append(("95 % over pairs", "", *(spread((found.low, found.high)) for found in intervals)))
     common.print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
     print(

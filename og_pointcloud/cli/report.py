@@ -32,12 +32,12 @@ def run(arguments: argparse.Namespace) -> None:
     text, rows, picture = (arguments.output / f"report{ending}" for ending in (".md", ".csv", ".png"))
     for path in (text, rows, picture):
         check_output("-o", path, arguments.captures)
-    from og_pointcloud.evaluate.knobs import QUICK, settings_of
+    from og_pointcloud.evaluate.knobs import QUICK_KNOBS, settings_of
     from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
     from og_pointcloud.evaluate.sweep_report import require_matplotlib, table, write_chart, write_report
 
     require_matplotlib()
-    few = QUICK if arguments.quick else None
+    few = QUICK_KNOBS if arguments.quick else None
     settings = settings_of(tuple(arguments.knob) if arguments.knob else few)
     # All are read before the first is worked on: what is missing in the last is told at once.
     subjects = [read_subject(folder) for folder in arguments.captures]

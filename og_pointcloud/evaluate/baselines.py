@@ -23,7 +23,7 @@ from og_pointcloud.cloud import unit_rows
 from og_pointcloud.fitting.fit import Prepared
 from og_pointcloud.fitting.photographs import Photographs
 
-MOSTLY = 0.5
+MIN_MASKED_SHARE = 0.5
 """Share of a point's visible weight that must lie in masks, or it belongs to none."""
 
 Words = NDArray[np.floating]
@@ -74,10 +74,10 @@ def baseline_labels(prepared: Prepared, words: Words) -> Iterator[tuple[str, Lab
 
 
 def only_where_masked(labels: Labels, prepared: Prepared) -> Labels:
-    """The labels, -1 for points that have at most MOSTLY of their visible weight in masks."""
+    """The labels, -1 for points that have at most MIN_MASKED_SHARE of their visible weight in masks."""
     table = prepared.table
     inside, outside = (np.asarray(part.sum(axis=0), np.float64).ravel() for part in (table.weights, table.outside))
-    return np.where(inside > MOSTLY * (inside + outside), labels, -1)
+    return np.where(inside > MIN_MASKED_SHARE * (inside + outside), labels, -1)
 
 
 def uplift(weights: csr_array, features: NDArray[np.floating], words: Words) -> Labels:

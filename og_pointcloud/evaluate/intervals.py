@@ -25,11 +25,11 @@ Doubles = NDArray[np.float64]
 Integers = NDArray[np.integer]
 
 DRAWS, BLOCK_DRAWS = 10_000, 2_000
-CHUNK = 1 << 21
+NUMBERS_PER_CHUNK = 1 << 21
 """Numbers drawn at once, which bounds the memory."""
-SMALLEST_EDGE = 8.0
+MIN_EDGE_SPACINGS = 8.0
 """Edge of the smallest cubes tried, in point spacings."""
-FEWEST_BLOCKS = 20
+MIN_BLOCKS = 20
 """Cubes that the median class must lie in, or cubes are too large."""
 
 
@@ -81,12 +81,12 @@ def miou_interval(
     points, true = np.asarray(xyz, np.float64)[counted], np.where(evaluated, truth.cls, -1)[counted]
     labellings = [labels[counted] for labels in (called, less) if labels is not None]
     intervals: list[BlockInterval] = []
-    edge = SMALLEST_EDGE * spacing
+    edge = MIN_EDGE_SPACINGS * spacing
     while True:
         block = _cubes(points, edge)
         present = _points_per_block(block, true, classes)
         # Too large by now: of the edges tried, the widest interval is the answer. The smallest edge always counts.
-        if intervals and np.median((present > 0).sum(axis=0)) < FEWEST_BLOCKS:
+        if intervals and np.median((present > 0).sum(axis=0)) < MIN_BLOCKS:
             return max(intervals, key=lambda interval: interval.high - interval.low)
         # IoU of a draw needs only sums over its blocks, of intersections and of unions, (blocks, classes) each.
         hits = [_points_per_block(block, np.where(labels == true, true, -1), classes) for labels in labellings]
@@ -139,6 +139,6 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockI
 def _draws(items: int, draws: int) -> Iterator[NDArray[np.int64]]:
     """(some draws, items) rows of items drawn with replacement, in parts that fit into memory; always the same."""
     random = np.random.default_rng(0)
-    step = max(1, CHUNK // items)
+    step = max(1, NUMBERS_PER_CHUNK // items)
     for start in range(0, draws, step):
         yield random.integers(0, items, (min(step, draws - start), items))

@@ -39,12 +39,12 @@ def changed(record: Any, path: str, value: Any) -> Any:
 
 DEFAULT = Setting("default", "")
 """A fit without settings."""
-ALL = 1_000_000_000
+ALL_POINTS = 1_000_000_000
 """More points than any cloud has."""
 NUMBERS: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "mode": ("mode", ("grouping", "fast")),
     "neighbors": ("geometry.neighbors", (12, 24, 48)),
-    "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL)),
+    "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL_POINTS)),
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),
     "sure share": ("membership.sure_share", (0.4, 0.6, 0.8)),
 }
@@ -52,7 +52,7 @@ NUMBERS: Mapping[str, tuple[str, tuple[Any, ...]]] = {
 
 
 def _label(value: Any) -> str:
-    return "all" if value == ALL else f"{value:,}" if isinstance(value, int) else str(value)
+    return "all" if value == ALL_POINTS else f"{value:,}" if isinstance(value, int) else str(value)
 
 
 KNOBS = {"views": tuple(Setting("views", f"one of {n}" if n > 1 else "all", every=n) for n in (1, 2, 4, 8))} | {
@@ -60,7 +60,7 @@ KNOBS = {"views": tuple(Setting("views", f"one of {n}" if n > 1 else "all", ever
     for name, (path, values) in NUMBERS.items()
 }
 """Name -> values, one of which is the default."""
-QUICK = ("mode", "views", "grouping sample")
+QUICK_KNOBS = ("mode", "views", "grouping sample")
 """Knobs of a report in a hurry."""
 
 

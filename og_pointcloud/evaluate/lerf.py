@@ -40,13 +40,13 @@ from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import TextFeatures
 
-ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
+MIN_ALPHA, MIN_IOU = 0.7, 0.25
 """The protocol's bounds, see above: of a rendered pixel's alpha, and of a pair's IoU for accuracy."""
 PUBLISHED_PAIRS = 208
 """(frame, object) pairs of the published table, in four scenes."""
 WAYS = ("best", "calibrated")
 LABEL_FOLDER = "label"
-SAME_PLACE = 0.01
+MAX_OFFSET_SPACINGS = 0.01
 """Share of the point spacing by which a fitted cloud and its Gaussians may lie apart."""
 
 Alpha = NDArray[np.floating]
@@ -166,7 +166,7 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
     if len(points) != len(cloud):
         raise SceneError(f"{file} has {len(points)} Gaussians, the scene {len(cloud)} points; expected one each")
     apart = float(np.abs(points.xyz_world - cloud.xyz_world).max(initial=0))
-    if apart > SAME_PLACE * cloud.spacing:
+    if apart > MAX_OFFSET_SPACINGS * cloud.spacing:
         raise SceneError(f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected those it is of")
     return Gaussians(cloud.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity)
 
@@ -200,21 +200,21 @@ def pair_ious(frame: LabelledFrame, alphas: Mapping[str, Alpha]) -> dict[str, fl
     """IoU of each object of a frame. alphas: category -> (H, W) alpha of its selection's render."""
     ious = {}
     for category, truth in frame.objects.items():
-        shown = alphas[category] > ALPHA_SHOWN
+        shown = alphas[category] > MIN_ALPHA
         union = int((shown | truth).sum())
         ious[category] = int((shown & truth).sum()) / union if union else 0.0
     return ious
 
 
 def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float]:
-    """Mean over scenes of their mIoU, and of their share of pairs above IOU_FOUND.
+    """Mean over scenes of their mIoU, and of their share of pairs above MIN_IOU.
 
     ious: scene -> (pairs,) IoU of all its (frame, object) pairs. Scenes without a pair are left out.
     """
     scenes = [np.asarray(values, np.float64) for values in ious.values() if len(values)]
     if not scenes:
         raise SceneError("no labelled object in any frame; expected at least one")
-    return float(np.mean([scene.mean() for scene in scenes])), float(np.mean([(s > IOU_FOUND).mean() for s in scenes]))
+    return float(np.mean([scene.mean() for scene in scenes])), float(np.mean([(s > MIN_IOU).mean() for s in scenes]))
 
 
 def _alpha(

@@ -34,9 +34,9 @@ TASKS: Mapping[int, tuple[int, ...]] = {
 """NYU40 ids of each task, by its number of classes."""
 SCENES = tuple(f"scene{number:04}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645))
 """The ten scenes of the table."""
-OPACITY_COUNTED = 0.1
+MIN_OPACITY = 0.1
 """Points of fainter Gaussians are ignored, see above."""
-NYU40_LARGEST = 40
+MAX_NYU40_ID = 40
 
 
 def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -46,9 +46,9 @@ def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]
     if vertices is None or "label" not in (vertices.dtype.names or ()):
         raise SceneError(f"{file} has no vertices with a property 'label'; expected ScanNet's *_vh_clean_2.labels.ply")
     labels = vertices["label"].astype(np.int64)
-    if len(labels) and not 0 <= labels.min() <= labels.max() <= NYU40_LARGEST:
+    if len(labels) and not 0 <= labels.min() <= labels.max() <= MAX_NYU40_ID:
         raise SceneError(
-            f"{file}: labels span {labels.min()}..{labels.max()}; expected NYU40 ids 0..{NYU40_LARGEST}: take the "
+            f"{file}: labels span {labels.min()}..{labels.max()}; expected NYU40 ids 0..{MAX_NYU40_ID}: take the "
             "labels of ScanNet v2, not those of ScanNet200"
         )
     return positions(vertices), labels.astype(np.int32)
@@ -76,5 +76,5 @@ def score_scene(
     task: 19, 15 or 10. opacity: (n,) of each point's Gaussian; None counts all points.
     """
     of_task = np.where(np.isin(truth, TASKS[task]), truth, -1)
-    opaque = np.ones(truth.shape, bool) if opacity is None else opacity >= OPACITY_COUNTED
+    opaque = np.ones(truth.shape, bool) if opacity is None else opacity >= MIN_OPACITY
     return score_labels(np.where(predicted > 0, predicted, -1), of_task, scored=opaque, min_points=1)

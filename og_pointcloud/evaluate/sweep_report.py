@@ -23,7 +23,7 @@ WIDTH, PANEL_HEIGHT = 11.0, 5.2
 LINEAR_BELOW = 0.01
 """Errors are on a logarithmic axis down to this one, and linear from there to 0."""
 TICKS = (0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
-FRONT = " *"
+FRONT_MARK = " *"
 """Behind the settings of the front, in tables."""
 
 
@@ -87,7 +87,7 @@ def write_report(sweep: Sweep, path: Path, chart: Path) -> Path:
     ]
     for capture in sweep.captures:
         rows = [row for row in sweep.rows if row.capture == capture]
-        parts += [f"## {capture}", f"Error is {error_name(rows)};{FRONT} marks the front."]
+        parts += [f"## {capture}", f"Error is {error_name(rows)};{FRONT_MARK} marks the front."]
         for row in rows:
             if row.is_default:
                 parts += _list("Left out by the default", (f"{one['what']}: {one['why']}" for one in row.left_out))
@@ -109,7 +109,7 @@ def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
     """A header, then the cells of each row; without the columns that no row has a figure for."""
     header = ("setting", "seconds", "error", "mIoU less the default's (95 %)", *SHARES, "instances")
     best = {id(row) for row in front(rows)}
-    lines = [_cells(row, FRONT if id(row) in best else "") for row in rows]
+    lines = [_cells(row, FRONT_MARK if id(row) in best else "") for row in rows]
     filled = [column for column in range(len(header)) if any(line[column] != "-" for line in lines)]
     return [tuple(line[column] for column in filled) for line in (header, *lines)]
 

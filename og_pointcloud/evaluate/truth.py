@@ -16,9 +16,9 @@ from og_pointcloud.formats.npy import read_npz
 
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
-OF_POINTS = ("background", "views", "ratio", "votes", "instance")
+POINT_ARRAYS = ("background", "views", "ratio", "votes", "instance")
 """Optional arrays of gt.npz, one value a point."""
-AGREED, VOTES = 0.5, 2
+MIN_VOTE_SHARE, MIN_VOTES = 0.5, 2
 """Least share of the votes that must agree on a class, and fewest votes, where classes were found by votes."""
 
 
@@ -65,14 +65,14 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
             "take a made room: og-pointcloud demo"
         )
-    entries = read_npz(path, ("cls", "names"), OF_POINTS, MAX_UNPACKED_BYTES, "'cls' (n,) and 'names' (L,)")
+    entries = read_npz(path, ("cls", "names"), POINT_ARRAYS, MAX_UNPACKED_BYTES, "'cls' (n,) and 'names' (L,)")
     cls, names = entries["cls"], entries["names"]
     if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
         raise SceneError(
             f"{path}: cls is {cls.dtype} {cls.shape} up to {cls.max(initial=-1)}, names {names.dtype} {names.shape}; "
             "expected whole numbers (n,) that index the names, and strings (L,)"
         )
-    for name in OF_POINTS:
+    for name in POINT_ARRAYS:
         if name in entries and entries[name].shape != cls.shape:
             raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one a point")
     instance = entries.get("instance")
@@ -83,6 +83,6 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
     if "views" in entries:
         scored &= entries["views"] > 0
     if "ratio" in entries and "votes" in entries:
-        scored &= (entries["ratio"] >= AGREED) & (entries["votes"] >= VOTES)
+        scored &= (entries["ratio"] >= MIN_VOTE_SHARE) & (entries["votes"] >= MIN_VOTES)
     background = entries["background"].astype(bool) if "background" in entries else None
     return Truth(cls, tuple(names.tolist()), scored, background, instance)

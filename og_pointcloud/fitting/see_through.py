@@ -13,7 +13,7 @@ from og_pointcloud.fitting.holes import seen_through_holes
 from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE, MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import get_num_threads, njit
-from og_pointcloud.rendering.splatting import Gaussians, seen_from
+from og_pointcloud.rendering.splatting import Gaussians, depth_and_slopes
 from og_pointcloud.settings import MembershipSettings
 
 
@@ -75,7 +75,7 @@ def _rays(xyz, points, pose):  # noqa: ANN001, ANN202
     """(n,) depths of these points, and (n, 2) their places in an image at depth 1."""
     depth, xy = np.empty(len(points)), np.empty((len(points), 2))
     for i, g in enumerate(points):
-        depth[i], xy[i, 0], xy[i, 1] = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
+        depth[i], xy[i, 0], xy[i, 1] = depth_and_slopes(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
     return depth, xy
 
 

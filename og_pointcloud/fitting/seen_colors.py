@@ -29,7 +29,7 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.journal import Journal, with_bar
 from og_pointcloud.kernels import get_num_threads, njit
-from og_pointcloud.rendering.splatting import seen_from
+from og_pointcloud.rendering.splatting import depth_and_slopes
 from og_pointcloud.scene import Points, View
 
 SEEN_PRIOR = 0.5
@@ -107,7 +107,7 @@ def _compared(xyz, rgb, image, intrinsics, pose, near, columns, exposure):  # no
     for g in range(len(xyz)):
         is_shown = next_shown < len(columns) and columns[next_shown] == g
         next_shown += is_shown
-        depth, x, y = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
+        depth, x, y = depth_and_slopes(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
         u, v = fx * x + cx, fy * y + cy
         if not (depth > near and 0 <= u < width and 0 <= v < height):
             continue

@@ -54,11 +54,11 @@ from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
-    chance_of_place,
     drawn_spacing,
     isotropic,
     near_plane,
     neighborhood,
+    position_hash,
     sample_of_points,
 )
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
@@ -364,7 +364,7 @@ def _points_to_draw(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[R
     finest = MIN_SPACING_PX
     while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MAX_SPLATS:
         finest *= 1.2
-    drawn = chance_of_place(cloud.points.xyz[rows], view.name) < part
+    drawn = position_hash(cloud.points.xyz[rows], view.name) < part
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
 
 

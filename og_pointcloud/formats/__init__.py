@@ -1,1 +1,1 @@
-"""One file per outside format."""
+"""One module per external format."""

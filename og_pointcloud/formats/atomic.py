@@ -17,26 +17,26 @@ from og_pointcloud.errors import OgPointcloudError
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there nobody keeps a second process out
+except ImportError:  # on Windows: there a second process is not kept out
     fcntl = None
 
 StrPath: TypeAlias = "str | os.PathLike[str]"
 """A path as callers give it."""
 LOCK = ".lock"
-"""The file in a folder by which processes know that another works there."""
+"""The file in a folder that tells processes that another works there."""
 STALE_S = 60.0
-"""A temporary file is left alone for so long: whoever has just made it may not have locked it yet."""
+"""A younger temporary file is left alone: its maker may not have locked it yet."""
 
 
 @contextmanager
 def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
-    """A file to write that takes the place of ``path`` when, and only when, the block ends without an error.
+    """A file to write that replaces ``path`` when, and only when, the block ends without an error.
 
-    Several processes may write one path at a time: each file is whole, and the last one stays. Missing folders above it
-    are made; what killed runs have left of the same path is removed.
-    durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one; False
-    for files whose readers check them. OSError names the path also where writing fails (a full disk). OgPointcloudError
-    where the path is a folder, or a device, which would be no more.
+    Several processes may write one path at a time: each file is whole, and the last one stays. Missing parent folders
+    are made; temporary files that killed runs left for the same path are removed.
+    durable: the file is on the disk before it replaces the path, so that not even a power cut leaves half of one; False
+    for files whose readers check them. OSError names the path even where writing fails (a full disk). OgPointcloudError
+    where the path is a folder, or a device, which would be destroyed.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
@@ -45,14 +45,14 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
     _remove_stale(path)
     temporary = _temporary(path)
     try:
-        with temporary.open("xb") as file:  # a new file, never one that was laid there, nor a link to another
+        with temporary.open("xb") as file:  # a new file, never one planted there, nor a link
             _hold(file)
             yield file
             if not file.closed:
                 file.flush()
                 if durable:
                     os.fsync(file.fileno())
-        os.replace(temporary, path)  # in one step: whoever opens the path finds the old file or the new one, whole
+        os.replace(temporary, path)  # atomic: readers find the old file or the new one, whole
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
@@ -60,7 +60,7 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
             raise OSError(error.errno, f"{error.strerror}, it was not written", str(path)) from error
         raise
     finally:
-        temporary.unlink(missing_ok=True)  # where it has not taken its place
+        temporary.unlink(missing_ok=True)  # where it has not replaced the path
 
 
 def write_file(path: StrPath, data: bytes) -> Path:
@@ -71,18 +71,18 @@ def write_file(path: StrPath, data: bytes) -> Path:
 
 
 def write_json(path: StrPath, value: Mapping[str, Any]) -> Path:
-    """Write a JSON file as people read it, whole or not at all; returns its path."""
+    """Write an indented JSON file, whole or not at all; returns its path."""
     text = json.dumps(value, indent=2, ensure_ascii=False)
     return write_file(path, text.encode(errors="backslashreplace") + b"\n")
 
 
 @contextmanager
 def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
-    """The path of a folder to make and to fill, which becomes ``path`` when, and only when, the block ends without an
-    error. overwrite: it may take the place of a folder that is there; else there must be none."""
+    """The path of a folder to make and fill, which becomes ``path`` when, and only when, the block ends without an
+    error. overwrite: it may replace an existing folder; else there must be none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # What killed runs have left: nobody holds its lock.
+    # Remove what killed runs left: nobody holds its lock.
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         if old.is_dir() and not old.is_symlink():
             with suppress(OgPointcloudError), locked(old):
@@ -92,12 +92,12 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
     try:
         with locked(temporary):
             yield temporary / path.name
-            # A folder that is not empty cannot be replaced: the old one steps aside first.
+            # A folder that is not empty cannot be replaced: the old one is moved aside first.
             moved = [path.rename(temporary / f"{path.name}.before")] if overwrite and path.exists() else []
             try:
                 os.replace(temporary / path.name, path)
             except BaseException:
-                for old in moved:  # back, or it would be removed with the temporary folder
+                for old in moved:  # move it back, or it would be removed with the temporary folder
                     old.rename(path)
                 raise
     finally:
@@ -108,7 +108,7 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
 def locked(folder: Path) -> Iterator[None]:
     """Make the folder and keep other processes out of it; OgPointcloudError where another is in it already.
 
-    However a process ends, its lock ends with it. A folder that is empty afterwards stays.
+    A process's lock ends with it, however it ends. A folder that is empty afterwards stays.
     """
     file = _lock_file(folder)
     try:
@@ -137,8 +137,8 @@ def _lock_file(folder: Path) -> IO[str]:
                 f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
                 "another folder"
             )
-        # A run that has just ended may have removed the file between opening and locking it: then a lock on it keeps
-        # nobody out, and the next turn makes a new one.
+        # A run that has just ended may have removed the file between our opening and locking it: then our lock keeps
+        # nobody out, and the next iteration makes a new one.
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), (folder / LOCK).stat()):
                 file.truncate(0)
@@ -149,7 +149,7 @@ def _lock_file(folder: Path) -> IO[str]:
 
 
 def _hold(file: IO[str] | IO[bytes]) -> bool:
-    """Lock a file that is open until it is closed; False where another has locked it."""
+    """Lock an open file until it is closed; False where another process has locked it."""
     if fcntl is not None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -165,7 +165,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _remove_stale(path: Path) -> None:
-    """Temporary files of this path that nobody writes any more."""
+    """Remove temporary files of this path that nobody writes any more."""
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         with suppress(OSError):
             if not old.is_symlink() and old.is_file() and time.time() - old.stat().st_mtime > STALE_S:

@@ -15,10 +15,10 @@ A view is called by its image's file stem, and so are its masks and features; wh
 it), by the path below the folder that all images share: ``left/000``, ``masks/left/000.png``.
 
 An image whose lens no pinhole can show (fisheye, equirectangular) becomes the faces of a cube, and a view each:
-``frame/front``, ``frame/left``. Masks are of the image as it is, ``masks/frame.png``, and are split with it, or of the
-faces, ``masks/frame/front.png``.
+``frame/front``, ``frame/left``. Masks belong to the image as it is, ``masks/frame.png``, and are split with it, or to
+the faces, ``masks/frame/front.png``.
 
-Masks rule the resolution: a camera takes the size of its mask map (shapes must agree), and its image is resized to it.
+Masks set the resolution: a camera takes the size of its mask map (shapes must agree), and its image is resized to it.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
-DECODED = 4
-"""Decoded mask maps that are kept for images with several faces, which are asked for one after the other."""
-FUSED_FRAMES = 300
-"""At most so many depth images are fused, spread evenly: neighbors in a recording show almost the same."""
+DECODED_MAPS = 4
+"""Decoded mask maps kept for images with several faces, which are read one after the other."""
+MAX_FUSED_FRAMES = 300
+"""Depth images that are fused at most, spread evenly: neighbors in a recording show almost the same."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ def read_capture(
     """Read a capture folder.
 
     gaussians: a cloud or 3DGS file to use instead of the folder's own geometry.
-    mask_level: of LangSplat's masks: default, small, medium or large (the paper's, and what None is). Masks of other
-        formats have no levels: SceneError where one is given.
-    repairs: of mistakes in the files, such as "axes=flipped" (formats/repairs.py lists them); left out, those that the
-        folder's ``repairs.json`` names, which `og-pointcloud repair` writes.
+    mask_level: of LangSplat's masks: default, small, medium or large (the paper's level, and that of None). Masks of
+        other formats have no levels: SceneError where one is given.
+    repairs: of mistakes in the files, such as "axes=flipped" (formats/repairs.py lists them); None: those in the
+        folder's ``repairs.json``, which `og-pointcloud repair` writes.
 
-    Masks and images are read later, on demand; poses, features and points are read here, and whatever file headers tell
-    is checked. Raises SceneError with the cause and the cure; warns of images that are listed but absent and of frames
-    without a pose, which are left out.
+    Masks and images are read later, on demand; poses, features and points are read here, and file headers are checked.
+    Raises SceneError with the cause and the cure; warns of images that are listed but absent and of frames without a
+    pose, which are left out.
 
     >>> import og_pointcloud as og
     >>> og.read_capture("no_such_folder")
@@ -157,7 +157,7 @@ def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> Captur
 
 
 def _stated_poses(capture: Path) -> CapturePoses:
-    """The images as pose files list them."""
+    """The images as the pose file lists them."""
     # Pose files that someone made for this capture come first; the folder of a data set is tried last.
     size_of, is_recording = partial(_size_of_image, capture), False
     if (file := next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)) is not None:
@@ -179,7 +179,7 @@ def _stated_poses(capture: Path) -> CapturePoses:
 
 
 def _recording(capture: Path) -> PosedFrames:
-    """What a data set's folder holds; SceneError where it is none of those that are known."""
+    """The frames of a data set's folder; SceneError where its layout is unknown."""
     frames = read_rgbd(capture)
     if frames is not None and frames.images:
         return frames
@@ -207,7 +207,7 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
     """File stems; where two images share one (rigs demand it), paths from the folder that all images share."""
     paths = [posixpath.normpath(without_suffix(image.path)) for image in images]
     stems = [posixpath.basename(path) for path in paths]
-    # Where two images have one path, no name tells them apart: the scene refuses such stems.
+    # Two images with the same path cannot be told apart by any name: the scene refuses such stems.
     if len(set(stems)) == len(stems) or len(set(paths)) < len(paths):
         return tuple(stems)
     paths = [path.lstrip("/") for path in paths]
@@ -220,8 +220,8 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
 
 
 def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
-    """The images that have masks, of a recording or where masks were made of some only; all of them if none has, since
-    reading the masks says that."""
+    """The images that have masks, for a recording or where masks were made for only some; all images if none has one,
+    as reading the masks then raises the error."""
     has_mask = [_has_mask(capture, name) or _has_mask(capture, posixpath.dirname(name)) for name in poses.names]
     if all(has_mask) or not any(has_mask):
         return poses
@@ -242,7 +242,7 @@ def _has_mask(capture: Path, name: str) -> bool:
 def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list[MaskLayer], str]:
     """The masks of each view, and the name of their feature space. Masks of a whole image are split with it."""
     faces = [image.face for image in poses.images]
-    # The name that each view's masks are stored under: of a cube's face without masks of its own, the image's.
+    # The name that each view's masks are stored under: the image's for a cube's face without masks of its own.
     called = [
         posixpath.dirname(name) if face and face.name and not _has_mask(capture, name) else name
         for name, face in zip(poses.names, faces, strict=True)
@@ -251,8 +251,8 @@ def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list
     read, feature_space = _read_masks(capture, distinct, level)
     stored = dict(zip(distinct, read, strict=True))
     # Faces of one image share its decoded map.
-    latest = lru_cache(maxsize=DECODED)(lambda name: stored[name].read())
-    # Masks of a whole image are cut to the view; those that a cube's face has of its own are of its pixels already.
+    latest = lru_cache(maxsize=DECODED_MAPS)(lambda name: stored[name].read())
+    # Masks of a whole image are cut to the view; a cube face's own masks have its pixels already.
     return [
         _layer_of(face, replace(stored[name], read=partial(latest, name)), view)
         if face and (not face.name or name != view)
@@ -262,7 +262,7 @@ def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list
 
 
 def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
-    """What a view shows of a whole image's masks; a cube's face keeps only the masks that it shows."""
+    """A view's part of a whole image's masks; a cube's face keeps only the masks that it shows."""
     _require_shape(view, layer, face.whole)
     scaled = face.of_whole_size(*layer.size)
     size = scaled.camera.width, scaled.camera.height
@@ -381,11 +381,11 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
 
 
 def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
-    """The frames that are fused: of a long recording every k-th, so that they are at most FUSED_FRAMES."""
+    """The frames that are fused: every k-th of a long recording, so that there are at most MAX_FUSED_FRAMES."""
     files = depth_files(capture, poses)
     images = dict(zip(poses.names, poses.images, strict=True))
     frames = []
-    for name in list(files)[:: max(1, -(-len(files) // FUSED_FRAMES))]:
+    for name in list(files)[:: max(1, -(-len(files) // MAX_FUSED_FRAMES))]:
         file = find_image(capture, images[name].path)
         colors = None if file is None else partial(_colors_at, file, images[name])
         frames.append(DepthFrame(name, files[name], colors))
@@ -438,7 +438,7 @@ def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, ori
 
 
 def read_photograph(file: Path, camera: Camera, face: Face | None) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB of the camera's size: the image, or what of it the face shows."""
+    """(H, W, 3) uint8 RGB of the camera's size: the image, or the part that the face shows."""
     if face is None:
         return read_rgb(file, (camera.width, camera.height))
     scaled = face.of_size(camera.width, camera.height)

@@ -103,7 +103,7 @@ def _file(model: Path, stem: str) -> Path | None:
 
 
 def _records(model: Path, stem: str, binary: Callable[[Path], Records], text: Callable[[Path], Records]) -> Records:
-    """What one of the two reads from the model's file of that name."""
+    """Read the model's file of that name by the reader for its format."""
     file = _file(model, stem)
     if file is None:
         raise SceneError(f"{model} has neither {stem}.bin nor {stem}.txt: export the model again or name a cloud")
@@ -123,7 +123,7 @@ def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
 def _camera(
     camera_model: str, size: tuple[int, int], values: dict[str, float]
 ) -> tuple[Callable[[DoubleArray], Camera], Lens | None]:
-    """A function from a pose (world to camera) to the camera, and the lens. values: by the names of the parameters."""
+    """A function from a pose (world to camera) to the camera, and the lens. values: by parameter name."""
     if camera_model == "EQUIRECTANGULAR":
         return partial(spherical_camera, *size), SPHERICAL
     # What is left of the values after focal lengths and principal point are the terms of the lens.
@@ -138,10 +138,10 @@ def _camera(
 
 def _cameras_text(file: Path) -> Iterator[CameraRecord]:
     for place, line, _ in _lines(file):
-        words = [*line.split(), *[""] * 4]  # "" for fields that are missing: then it is no number, and says so
+        words = [*line.split(), *[""] * 4]  # "" for missing fields, which then fail as numbers
         (camera_id,), camera_model, size = _numbers(int, words[:1], place), words[1], _numbers(int, words[2:4], place)
         names = _parameters(file, camera_id, camera_model)
-        if len(line.split()) > 4 + len(names):  # as where the model's name is another's
+        if len(line.split()) > 4 + len(names):  # as where the model's name is wrong
             raise SceneError(
                 f"{place}: a {camera_model} with more than {len(names)} parameters; expected {', '.join(names)}: name "
                 "the model that they are of"
@@ -167,7 +167,7 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str, Iterator[tuple[int, str]]]]:
-    """Lines that are no comments: each one's place, for errors, the line, and the numbered lines behind it."""
+    """Lines that are not comments: each line's place, for errors, its text, and the numbered lines after it."""
     with file.open(encoding="utf-8-sig", errors="replace") as stream:  # editors on Windows put a mark before the text
         lines = enumerate(stream, 1)
         for number, line in lines:
@@ -259,7 +259,7 @@ def _points_binary(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     last_start = len(data) - POINT.itemsize
     track_length = struct.Struct("<Q").unpack_from
     for row in range(len(offsets)):
-        if source.offset > last_start:  # called only where it fails: there are millions of records
+        if source.offset > last_start:  # called only on failure: there are millions of records
             source.require(POINT.itemsize)
         offsets[row] = source.offset
         source.offset += POINT.itemsize + TRACK_ELEMENT_BYTES * track_length(data, source.offset + TRACK_LENGTH_AT)[0]

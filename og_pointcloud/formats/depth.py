@@ -2,7 +2,7 @@
 
 16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are millimeters in a world of meters unless the
 data set says otherwise, stored floats are lengths of the world. The largest number of 16 bits, 65535, is what sensors
-write for "no reading" or "too far", and as little a depth as 0 is.
+write for "no reading" or "too far", and no depth, like 0.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class DepthFile:
         camera = self.camera.resized(width, height)
         if self.lens is None:
             return DepthImage(depth, camera)
-        front = faces(camera, self.lens)[0]  # the only one with the axis that depths are along
+        front = faces(camera, self.lens)[0]  # the only face whose axis depths are measured along
         return DepthImage(front.depths(depth), front.camera)
 
 
@@ -68,7 +68,7 @@ class DepthFile:
 class DepthFrame:
     """A depth image with the colors of its view.
 
-    colors: gives them at the pixels of a camera with the view's pose, (H, W, 3) uint8; None where there is no image.
+    colors: a function from a camera with the view's pose to its pixels' colors, (H, W, 3) uint8; None without an image.
     """
 
     name: str

@@ -22,7 +22,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, nami
 from og_pointcloud.formats.atomic import StrPath, write_file, write_json
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
-from og_pointcloud.formats.poses import LARGEST, pose_of_quaternion
+from og_pointcloud.formats.poses import MAX_NUMBER, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import DoubleArray, Points
 
@@ -30,14 +30,14 @@ E57_SIGNATURE = b"ASTM-E57"
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
-INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-CHUNK = 1 << 18
+INVALID_STATES = ("cartesianInvalidState", "sphericalInvalidState")
+POINTS_PER_CHUNK = 1 << 18
 """Points read at once."""
-MOST_POINTS_PER_BYTE = 8
+MAX_POINTS_PER_BYTE = 8
 """No scanner's file packs more; one that claims to is made to fill memory."""
-WHOLE_TURN = 0.02
+TURN_TOLERANCE = 0.02
 """A spherical image must span 360 degrees to within this share."""
-FROM_ALONG_X = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+SPHERICAL_FROM_OPENGL = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
 
@@ -49,7 +49,7 @@ def read_e57(path: StrPath) -> Points:
     parts: list[tuple[DoubleArray, NDArray[np.uint8] | None]] = []
     path = Path(path)
     with _opened(path) as (libe57, file):
-        most = MOST_POINTS_PER_BYTE * path.stat().st_size
+        most = MAX_POINTS_PER_BYTE * path.stat().st_size
         for scan in _children(file.root(), "data3D"):
             parts += _scan(libe57, file, scan, most)
             most -= scan["points"].childCount()  # several scans may name the same bytes
@@ -124,7 +124,7 @@ def _number(node: Any, name: str) -> float:
         raise SceneError(f"it has no {name}")
     field = node[name]  # a float, an integer, or an integer that counts steps of a scale
     value = float(field.scaledValue() if hasattr(field, "scaledValue") else field.value())
-    if not abs(value) <= LARGEST:
+    if not abs(value) <= MAX_NUMBER:
         raise SceneError(f"its {name} is {value}; expected a finite number")
     return value
 
@@ -152,9 +152,9 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[DoubleArra
     if vector.childCount() > most:
         raise SceneError(f"a scan claims {vector.childCount()} points, more than fit into the file: copy it again")
     colors = COLORS if fields.issuperset(COLORS) else ()
-    wanted = [*places, *colors, *(name for name in INVALID if name in fields)]
+    wanted = [*places, *colors, *(name for name in INVALID_STATES if name in fields)]
     # libE57 fills these arrays chunk by chunk, converted to float64 and scaled (the two True).
-    arrays = {name: np.zeros(min(CHUNK, max(vector.childCount(), 1))) for name in wanted}
+    arrays = {name: np.zeros(min(POINTS_PER_CHUNK, max(vector.childCount(), 1))) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
         buffers.append(libe57.SourceDestBuffer(file, name, array, len(array), True, True))
@@ -162,7 +162,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[DoubleArra
     reader = vector.reader(buffers)
     while count := reader.read():
         valid = np.ones(count, np.bool_)
-        for name in INVALID:  # 0: valid; 1, 2: only a direction, or nothing
+        for name in INVALID_STATES:  # 0: valid; 1, 2: only a direction, or nothing
             valid &= arrays[name][:count] == 0 if name in arrays else True
         xyz = np.column_stack([arrays[name][:count][valid] for name in places])
         xyz = xyz if places is CARTESIAN else _from_angles(*xyz.T)
@@ -211,7 +211,7 @@ def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, A
         keys |= {"cx": _number(shown, "principalPointX"), "cy": _number(shown, "principalPointY")}
     else:
         data = _whole_sphere(data, suffix, (width, height), (across, along))  # pixels span radians here
-        pose[:3, :3] = pose[:3, :3] @ FROM_ALONG_X
+        pose[:3, :3] = pose[:3, :3] @ SPHERICAL_FROM_OPENGL
         keys |= {"camera_model": "EQUIRECTANGULAR", "h": width // 2, "w": width // 2 * 2}
     write_file(folder / "images" / f"{name}{suffix}", data)
     return {"file_path": f"images/{name}{suffix}", "transform_matrix": pose.tolist(), **keys}
@@ -233,7 +233,7 @@ def _blob(shown: Any, most: int) -> tuple[str, bytes]:
 def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[float, float]) -> bytes:
     """The image with black above and below, twice as wide as high. pixel: radians, across and along."""
     (width, height), (across, along) = size, pixel
-    if abs(width * across / (2 * np.pi) - 1) > WHOLE_TURN or height * along > np.pi * (1 + WHOLE_TURN):
+    if abs(width * across / (2 * np.pi) - 1) > TURN_TOLERANCE or height * along > np.pi * (1 + TURN_TOLERANCE):
         turn, rise = np.degrees([width * across, height * along])
         raise SceneError(f"it spans {turn:.0f} x {rise:.0f} degrees; expected 360 across, and 180 at most")
     cv2 = require_cv2()

@@ -22,17 +22,17 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.scene import NOT_SEEN, Camera, DoubleArray, FloatArray, IntArray
 
-ONE_VIEW = float(np.tan(np.radians(55)))
-"""Tangent of the angle from the axis to a border; a pinhole that looks wider stretches its rim more than threefold."""
-CIRCULAR = float(np.radians(85))
-"""A lens that sees as far as this from its axis towards the middle of a border draws a circle, with black corners."""
-LEAST_SHARE = 0.005
+MAX_SINGLE_VIEW_TAN = float(np.tan(np.radians(55)))
+"""Tangent of the angle from the axis to a border; a wider pinhole view stretches its rim more than threefold."""
+CIRCULAR_LENS_RAD = float(np.radians(85))
+"""A lens that sees this far from its axis towards the middle of a border draws a circle, with black corners."""
+MIN_FACE_SHARE = 0.005
 """Share of a cube's face that the lens must see: less is not worth a view."""
-GRID = 257
-"""Rays a side on which it is tried what a lens sees."""
+GRID_RAYS = 257
+"""Rays per side of the grid on which a lens's field of view is probed."""
 CACHED_MAPS = 12
-"""Faces whose maps of masks are kept, 4 bytes a pixel each: those of two cameras whose images are read in turn. Of
-images, half as many, of 8 bytes."""
+"""Faces whose lookup maps for masks are kept, 4 bytes a pixel: those of two cameras whose images are read in turn. Half
+as many maps for images, of 8 bytes a pixel."""
 CUBE = {
     "front": np.eye(3),
     "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -58,12 +58,12 @@ class Face:
     lens: Lens
 
     def of_size(self, width: int, height: int) -> Face:
-        """This view in width x height pixels, of an image that is scaled alike."""
+        """This view at width x height pixels, with its image scaled alike."""
         size = _scaled(self.whole, width / self.camera.width, height / self.camera.height)
         return replace(self, camera=self.camera.resized(width, height), whole=self.whole.resized(*size))
 
     def of_whole_size(self, width: int, height: int) -> Face:
-        """The same of an image of width x height pixels."""
+        """This view of an image of width x height pixels."""
         size = _scaled(self.camera, width / self.whole.width, height / self.whole.height)
         return replace(self, camera=self.camera.resized(*size), whole=self.whole.resized(width, height))
 
@@ -94,7 +94,7 @@ class Face:
 
     @property
     def _key(self) -> _Key:
-        """All that decides which pixel shows what; views that share it share their maps."""
+        """All that determines which pixel shows what; views with the same key share their maps."""
         return self.name, _numbers(self.camera), _numbers(self.whole), self.lens
 
 
@@ -106,7 +106,7 @@ _Key = tuple[str, Numbers, Numbers, Lens]
 
 
 def faces(whole: Camera, lens: Lens) -> tuple[Face, ...]:
-    """The pinhole views of an image, of its focal lengths. whole: size, focal lengths, principal point and pose."""
+    """The pinhole views of an image, with its focal lengths. whole: size, focal lengths, principal point and pose."""
     boxes = _boxes(_numbers(whole), lens)
     made = []
     for name, (left, top, right, bottom) in boxes.items():
@@ -128,33 +128,32 @@ def _numbers(camera: Camera) -> Numbers:
 
 @lru_cache(maxsize=64)
 def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
-    """By face, the box that is seen of it, at depth 1. A single view is called "" and spans whole pixels of the
-    image."""
+    """The visible box of each face, at depth 1. A single view is called "" and spans whole pixels of the image."""
     width, height, fx, fy, cx, cy = whole
     # A grid twice as wide as the undistorted image would be resolves a telephoto lens; a wide one may see more than
     # that, and is tried again up to the widest single view.
     telephoto = 2 * max(abs(cx), abs(width - cx), 1.0) / fx, 2 * max(abs(cy), abs(height - cy), 1.0) / fy
-    half = min(max(telephoto), ONE_VIEW)
+    half = min(max(telephoto), MAX_SINGLE_VIEW_TAN)
     one, _ = _seen_box("front", whole, lens, half)
     if one is None or max(map(abs, one)) >= half:
-        half = ONE_VIEW
+        half = MAX_SINGLE_VIEW_TAN
         one, _ = _seen_box("front", whole, lens, half)
-    # A box that ends within the grid holds all that the lens sees.
+    # A box that ends within the grid contains all that the lens sees.
     if one is not None and not lens.wraps and max(map(abs, one)) < half:
         left, top, right, bottom = (round(at * f + c) for at, f, c in zip(one, (fx, fy) * 2, (cx, cy) * 2, strict=True))
         right, bottom = max(right, left + 1), max(bottom, top + 1)
         return {"": ((left - cx) / fx, (top - cy) / fy, (right - cx) / fx, (bottom - cy) / fy)}
     seen = {name: _seen_box(name, whole, lens, 1.0) for name in CUBE}
-    boxes = {name: box for name, (box, share) in seen.items() if box is not None and share > LEAST_SHARE}
+    boxes = {name: box for name, (box, share) in seen.items() if box is not None and share > MIN_FACE_SHARE}
     if "front" not in boxes:
         raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing before the camera: check the pose file")
     return boxes
 
 
 def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box | None, float]:
-    """For a face that reaches from -half to half at depth 1: the box around what the lens sees of it, and the share of
-    the face that it sees."""
-    at = np.linspace(-half, half, GRID)
+    """For a face from -half to half at depth 1: the box around the part that the lens sees, and its share of the
+    face."""
+    at = np.linspace(-half, half, GRID_RAYS)
 
     def seen(x: DoubleArray, y: DoubleArray) -> NDArray[np.bool_]:
         x, y = np.meshgrid(x, y)
@@ -165,10 +164,10 @@ def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box |
         return None, 0.0
     borders = []
     for end, axis in ((0, 0), (0, 1), (-1, 0), (-1, 1)):  # left, top, right, bottom
-        # The border lies between the last line of the grid that is seen and the next one: there, on a finer grid.
+        # The border lies between the grid's last visible line and the next one: search there on a finer grid.
         border = np.flatnonzero(coarse.any(axis=axis))[end]
-        beside = min(max(border + (1 if end else -1), 0), GRID - 1)
-        fine = np.linspace(min(at[border], at[beside]), max(at[border], at[beside]), GRID)
+        beside = min(max(border + (1 if end else -1), 0), GRID_RAYS - 1)
+        fine = np.linspace(min(at[border], at[beside]), max(at[border], at[beside]), GRID_RAYS)
         strip = seen(fine, at) if axis == 0 else seen(at, fine)
         borders.append(float(fine[np.flatnonzero(strip.any(axis=axis))[end]]))
     return (borders[0], borders[1], borders[2], borders[3]), float(coarse.mean())
@@ -179,7 +178,7 @@ def _image_pixels(rays: DoubleArray, whole: Numbers, lens: Lens) -> tuple[Double
     width, height, fx, fy, cx, cy = whole
     u, v = lens.project(rays)
     reach = max(cx, width - cx) / fx, max(cy, height - cy) / fy
-    if max(reach) > lens.radius(CIRCULAR):  # the corners of such an image are black: nothing was seen there
+    if max(reach) > lens.radius(CIRCULAR_LENS_RAD):  # the corners of such an image are black: nothing was seen there
         beyond = np.hypot(u, v) > max(reach)
         u, v = np.where(beyond, np.nan, u), np.where(beyond, np.nan, v)
     with np.errstate(over="ignore", invalid="ignore"):  # far beyond the image

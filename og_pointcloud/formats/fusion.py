@@ -1,11 +1,11 @@
-"""Depth images -> a cloud, for captures without one: what all views measured, averaged in voxels and judged by all.
+"""Depth images -> a cloud, for captures without one: all views' measurements, averaged in voxels and cross-checked.
 
-First pass: pixels that lie on a surface (flying pixels, between two, are left out) are averaged in voxels. Second pass:
-every view says of every voxel's point whether it measured that surface, looked through it, or could not see it. A point
-stays if more views confirm than refute it, and if two confirm it where three or more could have. It then moves to where
-the confirming views, on average, measured the surface: along each view's ray by the difference of the depths, which is
-one step towards the surface of a signed distance volume. So a noisy surface becomes one layer instead of as many layers
-as the noise fills voxels; points that then share a voxel are averaged once more.
+First pass: pixels that lie on a surface (without flying pixels, which lie between two) are averaged in voxels. Second
+pass: every view votes on every voxel's point: it measured that surface, looked through it, or could not see it. A point
+stays if more views confirm than refute it, and if two confirm it where three or more could have. It then moves to the
+confirming views' mean surface: along each view's ray by the difference of the depths, one step towards the surface of a
+signed distance volume. So a noisy surface becomes one layer instead of as many layers as the noise fills voxels; points
+that then share a voxel are averaged once more.
 
 The voxel follows from the images: two pixels wide at the median depth, and not finer than the noise with which views
 contradict each other.
@@ -29,43 +29,43 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.scene import Camera, DoubleArray, Points
 
-SURVEYED = 16
+SURVEYED_VIEWS = 16
 """Views, spread evenly, that are compared with each other before the fusion."""
-SAMPLES = 1000
-"""Pixels of a surveyed view that are looked up in the others."""
-COMPARABLE = 0.05
-"""Depths that differ by less than this share may be of one surface: its noise is measured on these."""
-AGREEING = 0.02
+PIXELS_PER_VIEW = 1000
+"""Sampled pixels of a surveyed view, looked up in the others."""
+SAME_SURFACE_SHARE = 0.05
+"""Depths that differ by less than this share may be of one surface: noise is measured on these."""
+AGREEING_SHARE = 0.02
 """Depths that differ by less than this share agree."""
 
 PIXELS_PER_VOXEL, NOISE_PER_VOXEL = 2.0, 1.0
 """Edge of a voxel, in pixel widths and in standard deviations of the noise: the larger of the two."""
-GRAZING = 5.7
-"""A surface's depth changes by at most so many pixel widths a pixel: it is seen 80 degrees off its normal (tan 80)."""
-STRAIGHT, BEND = 5, 0.25
-"""So many readings in a row, more than sensors put between two surfaces, are of one surface if the steps of their
+MAX_SLOPE = 5.7
+"""Of a surface's depth, in pixel widths per pixel: tan 80, for a surface seen 80 degrees off its normal."""
+LINE_READINGS, MAX_BEND_SHARE = 5, 0.25
+"""This many readings in a row, more than sensors put between two surfaces, are of one surface if the steps of their
 inverse depths differ by at most this share of the largest."""
 VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
-"""A point and a measured depth of its surface may lie so many voxels, or deviations of the noise, apart."""
-ROUNDS = 2
-"""Times that all views judge and move the points."""
+"""Largest distance of a point from a measured depth of its surface, in voxels and in deviations of the noise."""
+JUDGING_ROUNDS = 2
+"""Times that all views vote on the points and move them."""
 VOXELS_ACROSS = 1 << 21
 """Along each axis, so that a voxel's three indices fit one 64-bit key."""
 
-COMPARED = 12
-"""Views, spread evenly, that the check of the unit reads."""
-UNITS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
+CHECKED_VIEWS = 12
+"""Views, spread evenly, that the unit check reads."""
+UNIT_FACTORS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
 """Factors between units in use: meters, centimeters, millimeters, 1/4000 and 1/5000 m against 1/1000 m."""
-LEAST_AGREEING, LEAST_COMPARABLE = 0.2, 0.35
-"""If smaller shares of the depths agree, and differ little enough for one surface, the images are no depths of one
-place. Right ones agree in about half of the places; the rest is hidden in one of the views."""
-CONVINCING = 0.3
-"""Another unit is named if it makes the share of agreeing depths larger by this."""
+MIN_AGREEING_SHARE, MIN_SAME_SURFACE_SHARE = 0.2, 0.35
+"""If smaller shares of the depths agree, and are close enough for one surface, the images are no depths of one place.
+Right ones agree in about half of the places; the rest is hidden in one of the views."""
+MIN_UNIT_GAIN = 0.3
+"""Another unit is suggested if it increases the share of agreeing depths by more than this."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Measured on some frames, taken for all. depth: median measured depth. footprint: median width of a pixel on what
+    """Measured on some frames, used for all. depth: median measured depth. footprint: median width of a pixel on what
     it sees.
     noise: standard deviation of one view's depths of a surface, 0 where no two views overlap."""
 
@@ -114,7 +114,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
         colors = frame.colors(image.camera)[kept] if frame.colors else np.zeros((int(kept.sum()), 3), np.uint8)
         voxels.add(to_world(image, kept) - origin, colors, f"view '{frame.name}'")
     refused = 0
-    for _ in range(ROUNDS):
+    for _ in range(JUDGING_ROUNDS):
         xyz, rgb = voxels.means()
         stays, moved = _judge(xyz, origin, frames, found)
         if not stays.any():
@@ -134,9 +134,9 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
 
 def survey(frames: Sequence[DepthFrame]) -> Survey:
     """Depth, pixel width and noise, from evenly spread frames (from all, if those are empty)."""
-    images = [image for frame in evenly(frames, SURVEYED) if (image := frame.depth.read()).depth.any()]
+    images = [image for frame in evenly(frames, SURVEYED_VIEWS) if (image := frame.depth.read()).depth.any()]
     if not images:
-        images = [image for frame in frames if (image := frame.depth.read()).depth.any()][:SURVEYED]
+        images = [image for frame in frames if (image := frame.depth.read()).depth.any()][:SURVEYED_VIEWS]
     if not images:
         raise SceneError(
             f"none of the {len(frames)} depth images has a measured pixel (e.g. {frames[0].depth.path}); expected "
@@ -146,7 +146,7 @@ def survey(frames: Sequence[DepthFrame]) -> Survey:
     widths = [depth / np.float32(np.sqrt(i.camera.fx * i.camera.fy)) for depth, i in zip(depths, images, strict=True)]
     typical = float(np.median(np.concatenate(depths)))
     off = np.abs(_differences(images))
-    comparable = off[off < COMPARABLE]
+    comparable = off[off < SAME_SURFACE_SHARE]
     # 1.4826: from the median of absolute values to a standard deviation. The difference of two views has the noise of
     # both, the root of two times that of one; it is relative, so that it counts at the typical depth.
     noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
@@ -160,11 +160,11 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
 
 
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
-    """(H, W) bool: of every ``step``-th reading along each axis those that lie, in their row and in their column, on
-    one surface with a neighbor. slanted: readings on a surface seen at a flatter angle count too, if they are one of
-    STRAIGHT on a line. A map takes these, as it knows what its frames measured; in a fused cloud such points would hide
-    each other from a fit."""
-    steepest = GRAZING / image.camera.fx, GRAZING / image.camera.fy
+    """(H, W) bool: of every ``step``-th reading along each axis, those on one surface with a neighbor in their row and
+    in their column. slanted: readings on a surface seen at a flatter angle count too, if they are one of LINE_READINGS
+    on a line. A map takes these, as it knows what its frames measured; in a fused cloud such points would hide each
+    other from a fit."""
+    steepest = MAX_SLOPE / image.camera.fx, MAX_SLOPE / image.camera.fy
     return _on_surface(image.depth, step, steepest, NOISE_TOLERANCE * noise, slanted)
 
 
@@ -184,12 +184,12 @@ def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
             left = depth[row, column - 1] if column > 0 else none
             right = depth[row, column + 1] if column < width - 1 else none
             across = width == 1 or _near(z, left, steepest[0], slack) or _near(z, right, steepest[0], slack)
-            if not (across or (slanted and _straight(depth[row], column))):
+            if not (across or (slanted and _on_a_line(depth[row], column))):
                 continue
             above = depth[row - 1, column] if row > 0 else none
             below = depth[row + 1, column] if row < height - 1 else none
             down = height == 1 or _near(z, above, steepest[1], slack) or _near(z, below, steepest[1], slack)
-            chosen[row, column] = down or (slanted and _straight(depth[:, column], row))
+            chosen[row, column] = down or (slanted and _on_a_line(depth[:, column], row))
     return chosen
 
 
@@ -200,19 +200,19 @@ def _near(z, other, steepest, slack):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _straight(line, k):  # noqa: ANN001, ANN202
-    """Whether reading k of a row or column is one of STRAIGHT on a line. Inverse depths of a plane are linear in the
-    image; those of readings between two surfaces lie anywhere."""
-    for first in range(max(k - STRAIGHT + 1, 0), min(k, len(line) - STRAIGHT) + 1):
+def _on_a_line(line, k):  # noqa: ANN001, ANN202
+    """Whether reading k of a row or column is one of LINE_READINGS on a line. Inverse depths of a plane are linear in
+    the image; those of readings between two surfaces lie anywhere."""
+    for first in range(max(k - LINE_READINGS + 1, 0), min(k, len(line) - LINE_READINGS) + 1):
         low, high = np.inf, -np.inf
-        for j in range(first, first + STRAIGHT - 1):
+        for j in range(first, first + LINE_READINGS - 1):
             if line[j] <= 0 or line[j + 1] <= 0:
                 break
             change = 1 / line[j + 1] - 1 / line[j]
             low, high = min(low, change), max(high, change)
         else:
             # All steps have one sign (else the bound is below 0), and are about equal.
-            if high - low <= BEND * max(low, -high):
+            if high - low <= MAX_BEND_SHARE * max(low, -high):
                 return True
     return False
 
@@ -234,10 +234,10 @@ def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> DoubleArr
     depths taken times ``factor``."""
     found = [np.zeros(0)]
     for index, image in enumerate(images):
-        # About SAMPLES measured pixels, evenly spread; each is looked up in all other images.
+        # About PIXELS_PER_VIEW measured pixels, evenly spread; each is looked up in all other images.
         sampled = np.zeros(image.depth.shape, bool)
         rows = np.flatnonzero(image.depth)
-        sampled.reshape(-1)[rows[:: 1 + len(rows) // SAMPLES]] = True
+        sampled.reshape(-1)[rows[:: 1 + len(rows) // PIXELS_PER_VIEW]] = True
         xyz = to_world(image, sampled, factor)
         for other in [*images[:index], *images[index + 1 :]]:
             pixel, depth = _seen(xyz, other.camera)
@@ -264,7 +264,7 @@ def _judge(
         image = frame.depth.read()
         camera = image.camera
         surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
-        # A view looks through a point only if all pixels around do: a thin thing half a pixel off is still there.
+        # A view looks through a point only if all pixels around it do: a thin thing half a pixel off is still there.
         nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
         seen_from = camera.world_to_camera[:3, :3], camera.center - origin, camera.intrinsics
         depths, limits = (image.depth, surface, nearest), (found.tolerance, found.depth)
@@ -276,7 +276,7 @@ def _judge(
 
 @njit(cache=True, parallel=True)
 def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, ANN202
-    """One view's votes on all points: confirmed, refuted, could see; and the weighted way to the surface it measured.
+    """One view's votes on all points: confirmed, refuted, could see; and the weighted shift to its measured surface.
 
     seen_from: rotation to the camera, its center, and fx, fy, cx, cy. depths: (H, W) as measured; the same without
     flying pixels; the smallest of 3x3 pixels, 0 if one of them is unmeasured. limits: the tolerance, and the typical
@@ -297,7 +297,7 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
         v, u = int(row), int(column)
         # Noise and the width of pixels grow with depth.
         allowed = tolerance * max(1.0, along / typical)
-        # It could see the point if it measured nothing in front of it, and refutes it if all around lies behind it.
+        # The view could see the point if it measured nothing in front, and refutes it if all pixels around lie behind.
         votes[i, 2] += depth[v, u] >= along - allowed
         votes[i, 1] += nearest[v, u] > along + allowed
         difference = surface[v, u] - along
@@ -333,7 +333,7 @@ class _Voxels:
         x, y, z = (np.floor(xyz / self._edge).astype(np.int64) + VOXELS_ACROSS // 2).T
         keys = (x * VOXELS_ACROSS + y) * VOXELS_ACROSS + z
         self._waiting.append((keys, np.column_stack([xyz, rgb, np.ones(len(xyz))])))
-        # Merged only once as many wait as are there: a voxel is then sorted a few times, not once a frame.
+        # Merge only once as many wait as are merged: a voxel is then sorted a few times, not once a frame.
         if sum(len(keys) for keys, _ in self._waiting) > len(self._merged[0]):
             self._merge()
 
@@ -360,10 +360,10 @@ def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
     """A warning, with the cure, where views agree clearly better if all depths are taken in another unit, or agree in
     no unit; None where neither is so."""
     # Poses keep their unit, so that only the right one makes depths agree.
-    images = [image for frame in evenly(frames, COMPARED) if (image := frame.depth.read()).depth.any()]
-    shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNITS)}
-    best = max(UNITS, key=shares.__getitem__)
-    if shares[best] <= shares[1.0] + CONVINCING:
+    images = [image for frame in evenly(frames, CHECKED_VIEWS) if (image := frame.depth.read()).depth.any()]
+    shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNIT_FACTORS)}
+    best = max(UNIT_FACTORS, key=shares.__getitem__)
+    if shares[best] <= shares[1.0] + MIN_UNIT_GAIN:
         return _disagreement(images, max(shares.values()))
     return (
         f"the views' depths agree in {shares[1.0]:.0%} of places, and in {shares[best]:.0%} if all depths are taken "
@@ -374,8 +374,8 @@ def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
 
 def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
     """A warning where views overlap and agree in no unit. share: of depths that agree in the best unit."""
-    roughly = _agreement(images, 1.0, COMPARABLE)
-    if share >= LEAST_AGREEING or not roughly < LEAST_COMPARABLE:  # also where no views overlap
+    roughly = _agreement(images, 1.0, SAME_SURFACE_SHARE)
+    if share >= MIN_AGREEING_SHARE or not roughly < MIN_SAME_SURFACE_SHARE:  # also where no views overlap
         return None
     return (
         f"the views' depths agree in {share:.0%} of places, whatever the unit (right ones in half of them): poses "
@@ -384,7 +384,7 @@ def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
     )
 
 
-def _agreement(images: Sequence[DepthImage], factor: float, within: float = AGREEING) -> float:
+def _agreement(images: Sequence[DepthImage], factor: float, within: float = AGREEING_SHARE) -> float:
     """Share of depths that another view confirms if all are taken times ``factor``; NaN where no views overlap."""
     off = _differences(images, factor)
     return float((np.abs(off) < within).mean()) if len(off) else float("nan")

@@ -41,16 +41,16 @@ FIRST_FREE_CLASS, LAST_CLASS = 64, 255
 """Classes that the format leaves to its users: label k is class 64 + k."""
 STEPS_PER_EXTENT = 1e8
 """Coordinates are stored as 32-bit counts of a step: ten nanometers in a room, 10 micrometers in a city block."""
-FULL_RANGE = 257
-"""An 8-bit color times this spans the format's 16 bits."""
+SCALE_8_TO_16_BITS = 257
+"""An 8-bit color times this spans 16 bits."""
 EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 """Point formats before LAS 1.4 have 32 classes only: for each, the later format that holds all that it does."""
 DEGREES_PER_STEP = 0.006
-"""What scan angles count since LAS 1.4; before, whole degrees."""
+"""Unit of scan angles since LAS 1.4; before, whole degrees."""
 OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
-LONGEST_RECORD = 65_535
-SMALLEST_HEADER, RECORD_HEADER, LAST_RECORD_HEADER = 227, 54, 60
+MAX_RECORD_BYTES = 65_535
+MIN_HEADER_BYTES, RECORD_HEADER, LAST_RECORD_HEADER = 227, 54, 60
 """Bytes of the header of LAS 1.0 to 1.2, and of that of each variable length record, before and behind the points."""
 LAYERED = 3
 """LASzip's compressor whose chunks hold each field as a layer of its own."""
@@ -68,7 +68,7 @@ def read_las(path: StrPath) -> Points:
     rgb: list[NDArray[np.uint16]] = []
     with _opened(Path(path)) as reader:
         promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
-        if not (scales > 0).all():  # 0 puts all points into one place, a negative one mirrors them
+        if not (scales > 0).all():  # 0 puts all points in one place, a negative scale mirrors them
             raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
         has_colors = "red" in reader.header.point_format.dimension_names
         for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
@@ -130,7 +130,7 @@ def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArra
     las = laspy.LasData(header)
     las.xyz = np.asarray(xyz_world, np.float64)
     for channel, values in zip(("red", "green", "blue"), np.asarray(rgb, np.uint16).T, strict=True):
-        las[channel] = values * FULL_RANGE
+        las[channel] = values * SCALE_8_TO_16_BITS
     las.user_data = reason
     return las
 
@@ -149,7 +149,7 @@ def _points_of(source: Path, count: int) -> LasData:
     if "og_label" in own:  # an earlier run's class would be taken for one of the new labels
         las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
     las.remove_extra_dims(own)
-    for records in (las.vlrs, las.evlrs or []):  # COPC's say where its chunks are, which is nowhere the same
+    for records in (las.vlrs, las.evlrs or []):  # COPC's records locate its chunks, which now lie elsewhere
         records[:] = [record for record in records if record.user_id not in (RECORD_OWNER, "copc")]
     return las
 
@@ -173,8 +173,8 @@ def _opened(path: Path) -> Iterator[Any]:
 def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence[str], keep_classes: bool) -> None:
     laspy = _laspy()
     record = json.dumps(list(names)).encode()
-    if len(record) > LONGEST_RECORD:
-        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {LONGEST_RECORD}: ask for fewer")
+    if len(record) > MAX_RECORD_BYTES:
+        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {MAX_RECORD_BYTES}: ask for fewer")
     las.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
     # All at once: laspy copies the points for each call.
     las.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])
@@ -195,7 +195,7 @@ def _laspy() -> Any:
 def _check_counts(path: Path) -> None:
     """SceneError where the records, points, chunks or layers that a file announces would not fit into it."""
     size = path.stat().st_size
-    _require(size >= SMALLEST_HEADER, f"a file of {size} bytes has no whole header")
+    _require(size >= MIN_HEADER_BYTES, f"a file of {size} bytes has no whole header")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         # Before laspy parses the header: it reads as many records as this says.
         header_size, first_point, records, _, point_size = struct.unpack_from("<HIIBH", data, 94)
@@ -259,7 +259,7 @@ def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: in
 
 def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Colors span 16 bits, but many writers leave them at 8."""
-    return (rgb if rgb.max(initial=0) <= 255 else np.rint(rgb / FULL_RANGE)).astype(np.uint8)
+    return (rgb if rgb.max(initial=0) <= 255 else np.rint(rgb / SCALE_8_TO_16_BITS)).astype(np.uint8)
 
 
 def _grid(xyz_world: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:

@@ -9,7 +9,7 @@ perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``r8``: of r^8 beside k3
 fisheye      radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8): Kannala and Brandt, OpenCV's fisheye;
              p1, p2 and the thin prism's sx1, sy1 as in COLMAP's THIN_PRISM_FISHEYE.
 fov          radius atan(2 r tan(omega / 2)) / omega, r = tan(theta): Devernay and Faugeras 2001.
-division     radius d of which r = d / (1 + k d^2): Fitzgibbon 2001.
+division     radius d with r = d / (1 + k d^2): Fitzgibbon 2001.
 extended     x / (alpha sqrt(beta (x^2 + y^2) + z^2) + (1 - alpha) z): Khomutenko et al. 2016.
 spherical    longitude and latitude in radians; the whole sphere, x wraps around.
 """
@@ -28,7 +28,7 @@ from og_pointcloud.scene import Camera, DoubleArray
 Terms = Mapping[str, float]
 
 ANGLES = np.linspace(0.0, np.pi, 4097)[:-1]
-"""Angles from the axis, radians, at which it is tried how far out a lens sees."""
+"""Angles from the axis, radians, at which a lens's field of view is probed."""
 
 
 def _perspective(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
@@ -132,8 +132,8 @@ SPHERICAL = Lens("spherical", ())
 
 @lru_cache(maxsize=64)
 def widest(lens: Lens) -> float:
-    """The angle from the axis, radians, up to which a lens sees: as long as radii grow. Beyond, a polynomial turns back
-    and would show the inside of the image once more; and a perspective lens has no rays to the side or behind."""
+    """The angle from the axis, radians, up to which a lens sees: where radii stop growing. Beyond, a polynomial turns
+    back and would show the inside of the image again; and a perspective lens has no rays to the side or behind."""
     if lens.wraps:
         return np.inf
     with np.errstate(all="ignore"):

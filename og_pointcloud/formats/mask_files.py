@@ -37,7 +37,7 @@ PNG_COLOR_TYPES = {0: "gray", 2: "RGB (3 channels)", 3: "palette", 4: "gray with
 
 @dataclass(frozen=True)
 class MaskLayer:
-    """One view's masks before they meet a camera.
+    """One view's masks, before they are paired with a camera.
 
     size: (width, height) of the mask map. features: (M, D) float32. tracks: as `View.mask_tracks`.
     read: gives the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
@@ -69,7 +69,7 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
 
 
 def made_of_some(capture: Path) -> bool:
-    """Whether the record that lies with a capture's masks says that they are of every so many-th image alone."""
+    """Whether the record beside a capture's masks says that they were made for every n-th image only."""
     try:
         return read_json_object(capture / MASKS_FOLDER / MADE_NAME).get("every", 1) != 1
     except SceneError:  # masks of others have none
@@ -120,8 +120,8 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, FloatArr
 
 
 def rows_shown(ids: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
-    """(u,) which of ``count`` rows of features an id map shows, ascending; and (count + 2,) the place of each row among
-    these, to be indexed by ids: -1 for rows that are left out, and -1 and NOT_SEEN, its last two, for themselves."""
+    """(u,) the rows of ``count`` features that an id map shows, ascending; and (count + 2,) the place of each row among
+    these, to be indexed by ids: -1 for unused rows; ids -1 and NOT_SEEN, the last two entries, map to themselves."""
     used = np.flatnonzero(np.bincount(ids[ids >= 0], minlength=1))
     place = np.full(count + 2, -1, np.int32)
     place[NOT_SEEN] = NOT_SEEN

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import LARGEST, OPENGL, PosedFrames, PosedImage, inverse, read_json_object
+from og_pointcloud.formats.poses import MAX_NUMBER, OPENGL_SIGNS, PosedFrames, PosedImage, inverse, read_json_object
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -60,7 +60,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             camera_to_world = _matrix(frame, "transform_matrix")
             if np.isfinite(camera_to_world).all():  # trackers write NaN where they were lost
                 keys = {**shared, **frame}
-                camera = _camera(keys, inverse(camera_to_world * OPENGL), partial(image_size, path))
+                camera = _camera(keys, inverse(camera_to_world * OPENGL_SIGNS), partial(image_size, path))
                 lens = _lens(keys)
                 images.append(PosedImage(path, camera, lens, _depth(file.parent, keys, camera, lens)))
             else:
@@ -126,7 +126,7 @@ def _number(keys: dict[str, Any], key: str) -> float | None:
     value = keys.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= MAX_NUMBER:
         raise SceneError(f"{key} is {value!r:.80}; expected a finite number")
     return float(value)
 

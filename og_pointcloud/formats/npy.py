@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
-LONGEST_HEADER = 1 << 17
+MAX_HEADER_BYTES = 1 << 17
 """Bytes in which a header must end; numpy reads none of more than 10,000 characters."""
-LAST_CHARACTER = 0x10FFFF
+LAST_CODE_POINT = 0x10FFFF
 """The last code point of Unicode."""
-MOST_RATIO, PLENTY = 200, 1 << 26
-"""A file may unpack to so many times its own bytes, or to so many bytes. Vectors hardly shrink, masks by 100."""
+MAX_RATIO, ALWAYS_ALLOWED_BYTES = 200, 1 << 26
+"""A file may unpack to this many times its size, or to this many bytes. Vectors hardly shrink, masks by 100."""
 
 
 def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
     """A read-only array that lies in ``data``; ValueError where it is no .npy, holds objects, or differs in length."""
-    stream = io.BytesIO(data[:LONGEST_HEADER])
+    stream = io.BytesIO(data[:MAX_HEADER_BYTES])
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran_order, dtype = read(stream)
-        shape = tuple(map(int, shape))  # True is an int to numpy, until it counts bytes
+        shape = tuple(map(int, shape))  # numpy takes True for an int, until it counts bytes
     except (ValueError, SyntaxError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
@@ -44,13 +44,13 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
     # Otherwise an error would come later, without the file's name, where numpy makes strings of the numbers.
-    if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CHARACTER).any():
+    if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CODE_POINT).any():
         raise ValueError(f"it holds {dtype} text of characters that there are not")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
 
 
 def mapped_array(file: Path) -> NDArray[Any]:
-    """The array of a .npy file, of which only what is used is read. SceneError where it cannot be.
+    """The array of a .npy file, memory-mapped, so that only used parts are read. SceneError where it cannot be read.
 
     Not by numpy.load, which divides by zero, and with it ends the process, where a type has no bytes.
     """
@@ -67,24 +67,24 @@ def read_npz(
     file: Path,
     needed: Sequence[str],
     optional: Sequence[str],
-    most_bytes: int,
+    max_bytes: int,
     expected: str,
     kind: type[OgPointcloudError] = SceneError,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz that are needed, and the optional ones that it has, by name; a name may end in .npy itself.
 
     An error of this kind, which begins with the file, where it is none, lacks what is ``expected``, unpacks to more
-    than ``most_bytes``, is packed as numpy packs none, or claims to end beyond the file. Nothing is unpickled, and
+    than ``max_bytes``, is packed as numpy packs none, or claims to end beyond the file. Nothing is unpickled, and
     nothing is unpacked before its size is checked.
     """
     try:
         with zipfile.ZipFile(file) as archive:
             # numpy.savez appends .npy to names, to one that ends so too.
             held = {info.filename.removesuffix(".npy").removesuffix(".npy"): info for info in archive.infolist()}
-            if (total := sum(info.file_size for info in held.values())) > most_bytes:
-                raise ValueError(f"it unpacks to {total} bytes; expected at most {most_bytes}")
-            if total > max(PLENTY, MOST_RATIO * file.stat().st_size):
-                raise ValueError(f"it unpacks to {total} bytes, {MOST_RATIO} times its own: it is made to fill memory")
+            if (total := sum(info.file_size for info in held.values())) > max_bytes:
+                raise ValueError(f"it unpacks to {total} bytes; expected at most {max_bytes}")
+            if total > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * file.stat().st_size):
+                raise ValueError(f"it unpacks to {total} bytes, {MAX_RATIO} times its own: it is made to fill memory")
             arrays = {name: _array_from_zip(archive, held[name]) for name in (*needed, *optional) if name in held}
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
         raise kind(

@@ -24,7 +24,7 @@ import numpy as np
 from og_pointcloud.formats.depth import MILLIMETER
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import (
-    OPENGL,
+    OPENGL_SIGNS,
     RecordedFrame,
     Sensor,
     inverse,
@@ -40,8 +40,8 @@ from og_pointcloud.formats.poses import (
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
-SAME_TIME_S = 0.01
-"""Seconds between an image and its pose, at most."""
+MAX_OFFSET_S = 0.01
+"""Between an image and its pose."""
 
 
 def _sensor(width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Sensor:
@@ -62,7 +62,7 @@ def _polycam(folder: Path) -> Iterator[RecordedFrame]:
             continue
         content = read_json_object(source)
         sensor = _sensor(*named_numbers(content, POLYCAM_KEYS, source))
-        pose = np.reshape(named_numbers(content, POSE_KEYS, source), (3, 4)) * OPENGL
+        pose = np.reshape(named_numbers(content, POSE_KEYS, source), (3, 4)) * OPENGL_SIGNS
         yield RecordedFrame(path, source, pose, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"))
 
 
@@ -77,7 +77,7 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
             yield RecordedFrame(file.name, source)
             continue
         content = read_json_object(source)
-        pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL
+        pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL_SIGNS
         # 3 x 3, row by row.
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
         sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)  # it counts pixel centers at whole numbers
@@ -95,7 +95,7 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
         path, lens = f"lowres_wide/{file.name}", folder / "lowres_wide_intrinsics" / f"{file.stem}.pincam"
         time = re.search(r"_(\d+\.\d+)$", file.stem)
         nearest = rows[np.abs(rows[:, 0] - float(time[1])).argmin()] if time else None
-        if nearest is None or time is None or not lens.is_file() or abs(nearest[0] - float(time[1])) > SAME_TIME_S:
+        if nearest is None or time is None or not lens.is_file() or abs(nearest[0] - float(time[1])) > MAX_OFFSET_S:
             yield RecordedFrame(path, lens)
             continue
         width, height, fx, fy, cx, cy = named_numbers(read_numbers(lens, 6).ravel(), range(6), lens)

@@ -24,7 +24,7 @@ import numpy as np
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import LARGEST, OPENGL, PosedFrames, PosedImage, inverse, rigid
+from og_pointcloud.formats.poses import MAX_NUMBER, OPENGL_SIGNS, PosedFrames, PosedImage, inverse, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera, DoubleArray
 
@@ -32,11 +32,11 @@ ImageSize = Callable[[str], tuple[int, int]]
 
 MAX_BYTES = 1 << 28
 HEAD_BYTES = 4096
-"""Bytes within which a file shows what it is."""
-MOST_SKEW_PX = 1.0
-"""Shift by the skew b2, at the upper and the lower border, that is neglected."""
-FULL_FRAME = 36.0
-"""Millimeters of the longer side of the 35 mm film that RealityScan's lengths are of."""
+"""Bytes that are enough to recognize a file."""
+MAX_SKEW_PX = 1.0
+"""Largest neglected shift by the skew b2, at the upper and lower border."""
+FULL_FRAME_MM = 36.0
+"""Longer side of the 35 mm film that RealityScan's lengths refer to."""
 COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
 
 
@@ -137,7 +137,7 @@ def _world_of(element: ElementTree.Element) -> World | None:
 
 def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleArray, world: World) -> PosedImage:
     scale, rotation, translation = world
-    with np.errstate(all="ignore"):  # the camera refuses what comes of it
+    with np.errstate(all="ignore"):  # the camera refuses the result
         pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
     # A sensor may have an initial and an adjusted calibration: poses belong to the adjusted one.
     calibrations = sensor.findall("calibration")
@@ -156,7 +156,7 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleAr
     focal = terms.pop("f", 0.0)
     # u = width / 2 + cx + x f + x b1 + y b2, v = height / 2 + cy + y f (Metashape's manual, camera models).
     cx, cy, skew = width / 2 + terms.pop("cx", 0.0), height / 2 + terms.pop("cy", 0.0), terms.pop("b2", 0.0)
-    if abs(skew) * height > 2 * MOST_SKEW_PX * max(focal, 1.0):
+    if abs(skew) * height > 2 * MAX_SKEW_PX * max(focal, 1.0):
         raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimize the cameras without b2")
     camera = Camera(width, height, focal + terms.pop("b1", 0.0), focal, cx, cy, pose)
     return PosedImage(label, camera, _metashape_lens(kind, terms))
@@ -213,9 +213,9 @@ def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> It
                 raise SceneError("it names no image; expected #name first: export it again")
             values = _numbers(line)
             width, height = image_size(name)
-            scale = max(width, height) / FULL_FRAME  # pixels a millimeter
+            scale = max(width, height) / FULL_FRAME_MM  # pixels a millimeter
             center = np.array([values["x"], values["y"], values["alt"]])
-            pose = rigid(_looking_down(values["heading"], values["pitch"], values["roll"]), center) * OPENGL
+            pose = rigid(_looking_down(values["heading"], values["pitch"], values["roll"]), center) * OPENGL_SIGNS
             camera = Camera(
                 width, height, scale * values["f"], scale * values["f"], width / 2 + scale * values["px"],
                 height / 2 + scale * values["py"], inverse(pose),
@@ -236,7 +236,7 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
             values[column] = float(text or 0)
         except (TypeError, ValueError):
             values[column] = np.nan
-        if not abs(values[column]) <= LARGEST:
+        if not abs(values[column]) <= MAX_NUMBER:
             raise SceneError(f"{column} is '{text!s:.40}'; expected a number")
     return values
 

@@ -22,8 +22,8 @@ from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_row
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
 
-MOST_PROPERTIES = 1024
-LONGEST_NAME = 80
+MAX_PROPERTIES = 1024
+MAX_NAME_LENGTH = 80
 """Bounds of what a header may declare, far beyond any writer's."""
 
 NUMPY_TYPES = {
@@ -131,11 +131,11 @@ def _parse_header(head: bytes) -> _Header:
                 continue
             case ["format", encoding, "1.0"] if encoding in BYTE_ORDERS and byte_order is None:
                 byte_order = BYTE_ORDERS[encoding]
-            case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count) and len(name) <= LONGEST_NAME:
+            case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count) and len(name) <= MAX_NAME_LENGTH:
                 if any(name == element.name for element in elements):
                     raise SceneError(f"header line {number}: element '{name}' is declared twice")
                 elements.append(_Element(name, int(count)))
-            case ["property", *words] if words and elements and all(len(word) <= LONGEST_NAME for word in words):
+            case ["property", *words] if words and elements and all(len(word) <= MAX_NAME_LENGTH for word in words):
                 _add_property(elements[-1], words, number)
             case _:
                 raise SceneError(
@@ -160,8 +160,8 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
     kind, name = words
     if kind not in NUMPY_TYPES:
         raise SceneError(f"header line {number}: unknown type {kind!r:.60}; expected one of {', '.join(NUMPY_TYPES)}")
-    if len(element.columns) >= MOST_PROPERTIES:
-        raise SceneError(f"header line {number}: element '{element.name}' has more than {MOST_PROPERTIES} properties")
+    if len(element.columns) >= MAX_PROPERTIES:
+        raise SceneError(f"header line {number}: element '{element.name}' has more than {MAX_PROPERTIES} properties")
     if name in element.columns:
         raise SceneError(f"header line {number}: element '{element.name}' has property '{name}' twice")
     element.columns[name] = NUMPY_TYPES[kind]

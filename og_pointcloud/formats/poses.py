@@ -1,5 +1,5 @@
-"""What every pose file gives, whatever its format: one record per image, in world coordinates. And what the readers of
-pose files share: cameras without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
+"""The common result of all pose files: one record per image, in world coordinates. And what their readers share:
+cameras without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera, DoubleArray
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
-LARGEST = 1e30
-"""Bound of numbers in a pose file: anything beyond is damage. Their squares are still finite."""
-OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
-"""Factors of the columns of a camera-to-world pose, between OpenGL's axes (y up, z back) and OpenCV's."""
+MAX_NUMBER = 1e30
+"""Larger numbers in a pose file mean damage. Squares of smaller ones are finite."""
+OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
+"""Factors of a camera-to-world pose's columns, between OpenGL's axes (y up, z back) and OpenCV's."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PosedImage:
     path: as written there, with forward slashes; relative to the capture folder or to its image folder.
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
     lens: None for a pinhole. depth: the depth image that the pose file or data set has for it.
-    face: of a view, where in the image it lies; None where the image is the view.
+    face: where a view lies in the image; None where the image is the view.
     """
 
     path: str
@@ -48,7 +48,7 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class PosedFrames:
-    """What a pose file or a data set's folder holds. dropped: paths of images without a finite pose (trackers get
+    """The contents of a pose file or a data set's folder. dropped: paths of images without a finite pose (trackers get
     lost). ply_file_path: of the cloud that the file names, as written there."""
 
     images: tuple[PosedImage, ...]
@@ -107,7 +107,7 @@ class RecordedFrame:
 
 
 def recorded(frames: Iterable[RecordedFrame]) -> PosedFrames:
-    """What a data set's folder holds, of all its frames."""
+    """The posed images of a data set's folder, and the frames without a pose."""
     read = [(frame.path, frame.image()) for frame in frames]
     return PosedFrames(
         tuple(image for _, image in read if image is not None), tuple(path for path, image in read if image is None)
@@ -136,7 +136,7 @@ def rigid(rotation: DoubleArray, translation: DoubleArray) -> DoubleArray:
 def inverse(transform: DoubleArray) -> DoubleArray:
     """(4, 4) inverse of a rigid transform (3 or 4, 4)."""
     rotation = transform[:3, :3].T
-    with np.errstate(over="ignore", invalid="ignore"):  # `Camera` refuses what absurd numbers become
+    with np.errstate(over="ignore", invalid="ignore"):  # `Camera` refuses the result of absurd numbers
         return rigid(rotation, -rotation @ transform[:3, 3])
 
 
@@ -227,7 +227,7 @@ def the_only(folder: Path, pattern: str, what: str) -> Path | None:
 
 
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
-    """What a JSON file of bounded size holds (in memory up to twenty times its bytes). SceneError where it is none."""
+    """The content of a JSON file of bounded size (in memory up to 20 times larger). SceneError if it is not JSON."""
     text = read_text(file, most)
     try:
         return json.loads(text)
@@ -236,7 +236,7 @@ def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
 
 
 def read_json_object(file: Path) -> dict[str, Any]:
-    """As `read_json`, of a file that holds one object."""
+    """As `read_json`, for a file that holds one object."""
     content = read_json(file)
     if not isinstance(content, dict):
         raise SceneError(f"{file} holds {content!r:.40}; expected a JSON object: export or fetch it again")
@@ -273,6 +273,6 @@ def named_numbers(content: Any, keys: Sequence[Any], source: Path | str) -> list
         values = [float(content[key]) for key in keys]
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):
         values = []
-    if not values or not np.abs(values).max() <= LARGEST:
+    if not values or not np.abs(values).max() <= MAX_NUMBER:
         raise SceneError(f"{source} lacks finite numbers {', '.join(map(str, keys)):.120}: export or copy it again")
     return values

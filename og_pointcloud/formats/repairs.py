@@ -1,9 +1,9 @@
-"""Mistakes in a capture's files, put right on reading: the files stay as they are.
+"""Mistakes in a capture's files, corrected on reading: the files stay as they are.
 
-A repair is one word, ``name=value``. They are applied in their order to what the pose and mask files say; points are
-never touched, so that answers stay in the cloud's frame. ``repairs.json`` in a capture folder lists those that every
-command applies; `og-pointcloud repair` writes it, and the checks of a capture (og_pointcloud.checking) try the same
-table, `KINDS`, to find out what a capture means.
+A repair is one word, ``name=value``. Repairs are applied in order to the contents of the pose and mask files; points
+are never touched, so that answers stay in the cloud's frame. ``repairs.json`` in a capture folder lists those that
+every command applies; `og-pointcloud repair` writes it, and the checks of a capture (og_pointcloud.checking) try the
+same table, `KINDS`, to find out what a capture means.
 
   axes=flipped          the cameras' y and z axes point the other way: OpenCV's where OpenGL's are read, or the reverse
   direction=inverse     poses are world-to-camera where camera-to-world is read, or the reverse
@@ -48,25 +48,25 @@ from og_pointcloud.formats.poses import (
 from og_pointcloud.scene import Camera, DoubleArray, IntArray
 
 REPAIRS_NAME = "repairs.json"
-MOST_REPAIRS = 16
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+MAX_REPAIRS = 16
+OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MASK_FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "mirrored": lambda ids: ids[:, ::-1],
     "upside-down": lambda ids: ids[::-1],
     "turned": lambda ids: ids[::-1, ::-1],
 }
 MASK_SHIFTS = {"next": 1, "previous": -1}
-WORLDS = tuple(
+AXIS_NAMES = tuple(
     ",".join(sign + axis for sign, axis in zip(signs, axes, strict=True))
     for axes in itertools.permutations("xyz")
     for signs in itertools.product(("", "-"), repeat=3)
 )[1:]
-"""All ways to name axes but the one that changes nothing; half of them mirror the world."""
+"""All signed axis permutations but the identity; half of them mirror the world."""
 
 
 @dataclass(frozen=True)
 class Repair:
-    """One repair, as the list above has it. numbers: those of its value, where they are numbers.
+    """One repair of the list above. numbers: those in its value, if it has some.
 
     >>> str(Repair.parse("scale=2.5")), Repair.parse("scale=2.5").numbers
     ('scale=2.5', (2.5,))
@@ -116,14 +116,14 @@ class Kind:
 
 
 def read_repairs(capture: Path) -> tuple[Repair, ...]:
-    """What ``repairs.json`` of a capture folder lists, in its order; none without that file."""
+    """The repairs in a capture folder's ``repairs.json``, in order; none without that file."""
     file = capture / REPAIRS_NAME
     if not file.is_file():
         return ()
     listed = read_json_object(file).get("repairs")
-    if not isinstance(listed, list) or len(listed) > MOST_REPAIRS or not all(isinstance(text, str) for text in listed):
+    if not isinstance(listed, list) or len(listed) > MAX_REPAIRS or not all(isinstance(text, str) for text in listed):
         raise SceneError(
-            f'{file} is not {{"repairs": [texts]}} with at most {MOST_REPAIRS} of them: write it again with '
+            f'{file} is not {{"repairs": [texts]}} with at most {MAX_REPAIRS} of them: write it again with '
             "'og-pointcloud repair', or remove it"
         )
     return tuple(map(Repair.parse, listed))
@@ -139,7 +139,7 @@ def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> li
 
 
 def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
-    """The images as the pose file means them. Depth images move and scale with their photographs."""
+    """The images after these repairs. Depth images move and scale with their photographs."""
     cameras = repaired_cameras([image.camera for image in images], repairs)
     # All images have an entry, so that repairs of all cameras together shift depth images as they shift photographs.
     depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
@@ -152,7 +152,7 @@ def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> 
 
 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
-    """The masks as their files mean them; layers: in the order of the pose file."""
+    """The masks after these repairs; layers: in the order of the pose file."""
     repaired = list(layers)
     # In the order in which they are listed: a shift of images and a flip of each do not depend on each other.
     for value in (repair.value for repair in repairs if repair.name == "masks"):
@@ -170,7 +170,7 @@ def _read_repaired(read: Callable[[], IntArray], value: str) -> IntArray:
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """Those between commas; none where they are not finite numbers."""
+    """The numbers between commas; none where they are not finite numbers."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -186,7 +186,7 @@ def _each(change: Callable[[Camera, Repair], Camera]) -> Change:
 
 
 def _each_pose(change: Callable[[DoubleArray, Repair], DoubleArray]) -> Change:
-    """Of world_to_camera, (4, 4)."""
+    """A change of world_to_camera, (4, 4)."""
     return _each(lambda camera, repair: replace(camera, world_to_camera=change(camera.world_to_camera, repair)))
 
 
@@ -248,10 +248,10 @@ def _none(cameras: list[Camera], repair: Repair) -> list[Camera]:
 
 
 KINDS = {
-    "axes": Kind(_each_pose(lambda pose, repair: FLIP @ pose), ("flipped",)),
+    "axes": Kind(_each_pose(lambda pose, repair: OPENGL_FLIP @ pose), ("flipped",)),
     "direction": Kind(_each_pose(lambda pose, repair: np.asarray(np.linalg.inv(pose), np.float64)), ("inverse",)),
     "quaternions": Kind(_each_pose(_with_xyzw), ("xyzw",)),
-    "world": Kind(_each_pose(_with_axes), WORLDS),
+    "world": Kind(_each_pose(_with_axes), AXIS_NAMES),
     "frames": Kind(_neighbors, ("1", "-1"), of_all=True),
     "center": Kind(_each(_centered), ("swapped", "middle")),
     "scale": Kind(

@@ -5,7 +5,7 @@ rotations as three bytes x y z (version 2) or as the smallest three of four part
 gzip of all; version 4 packs each column by itself with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's (y
 up, z back), those of a PLY and of the scene are as trained (y down, z forward): y and z change sign, as in converters.
 
-Harmonics above the constant one are not read, as of PLY files, nor written.
+Harmonics above the constant one are neither read, as in PLY files, nor written.
 
 Format: nianticlabs/spz, README, "Internals"; held against SuperSplat's files in the tests.
 """
@@ -32,22 +32,22 @@ MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, splats, degree of the harmonics, fraction bits, flags, and of version 4 the number of columns."""
 HARMONICS = (0, 3, 8, 15, 24)
-"""Coefficients a channel above the constant one, by degree."""
-COLOR_SCALE, LOG_SCALE_STEPS, LOG_SCALE_LEAST = 0.15, 16.0, -10.0
-"""A byte stands for f_dc as byte / 255 = 0.5 + 0.15 f_dc, for a log scale in steps of 1/16 from -10 on."""
-FIXED_POINT = 1 << 23
-"""The sign bit of 24."""
-MOST_FRACTION_BITS = 23
-MAGNITUDE = 511
-"""The largest of the nine bits that a part of a rotation has beside its sign."""
-PLACES = np.array([20, 10, 0], np.uint32)
-"""Bits by which the three smaller parts, ten bits each, are shifted, in their order."""
-TURNED = np.array([1.0, -1.0, -1.0])
-"""Factors of x, y, z, of positions and of quaternions, from one convention of axes to the other."""
-MOST_RATIO, PLENTY = 20, 1 << 24
-"""A file may unpack to so many times its own bytes, or to so many bytes: quantized noise shrinks to a half."""
-COARSEST = 1e-4
-"""The largest step to which positions may be rounded, as a share of the cloud's extent."""
+"""Coefficients per channel above the constant one, by degree."""
+COLOR_SCALE, LOG_SCALE_STEPS, MIN_LOG_SCALE = 0.15, 16.0, -10.0
+"""A byte encodes f_dc as byte / 255 = 0.5 + 0.15 f_dc, and a log scale in steps of 1/16 from -10 on."""
+SIGN_BIT = 1 << 23
+"""Of 24-bit integers."""
+MAX_FRACTION_BITS = 23
+MAX_MAGNITUDE = 511
+"""Of a rotation's part, nine bits beside its sign."""
+PART_SHIFTS = np.array([20, 10, 0], np.uint32)
+"""Bits by which the three smaller parts of a rotation, ten bits each, are shifted, in order."""
+AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
+"""Factors of x, y, z, of positions and of quaternions, between the two axis conventions."""
+MAX_RATIO, ALWAYS_ALLOWED_BYTES = 20, 1 << 24
+"""A file may unpack to this many times its size, or to this many bytes: quantized noise shrinks to a half."""
+MAX_STEP_SHARE = 1e-4
+"""Largest rounding step of positions, as a share of the cloud's extent."""
 
 
 def looks_like_spz(head: bytes) -> bool:
@@ -68,10 +68,10 @@ def read_spz(path: StrPath) -> Points:
         positions, opacity, color, log_scale, rotation = columns
         xyz = _fixed_point(positions.reshape(count, 3, 3)) / 2.0**bits
         base = 0.5 + SH_CONSTANT * (color.reshape(count, 3) / 255 - 0.5) / COLOR_SCALE
-        scale = np.exp(log_scale.reshape(count, 3) / LOG_SCALE_STEPS + LOG_SCALE_LEAST).astype(np.float32)
+        scale = np.exp(log_scale.reshape(count, 3) / LOG_SCALE_STEPS + MIN_LOG_SCALE).astype(np.float32)
         xyzw = _three_bytes(rotation) if len(rotation) == 3 * count else _smallest_three(rotation.view("<u4"))
-        wxyz = np.column_stack([xyzw[:, 3], xyzw[:, :3] * TURNED])
-        return activated(xyz * TURNED, scale, wxyz, opacity / 255, base)
+        wxyz = np.column_stack([xyzw[:, 3], xyzw[:, :3] * AXIS_SIGNS])
+        return activated(xyz * AXIS_SIGNS, scale, wxyz, opacity / 255, base)
 
 
 def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
@@ -83,11 +83,11 @@ def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
     path = Path(path)
     with naming(path):
         scale, rotation, opacity = points.gaussians
-        positions, bits = _as_fixed_point(points.xyz_world * TURNED)
+        positions, bits = _as_fixed_point(points.xyz_world * AXIS_SIGNS)
         color = points.rgb if rgb is None else rgb
         base = (np.full(points.xyz.shape, 127.5) if color is None else color) / 255 - 0.5
         with np.errstate(divide="ignore"):  # a scale of 0 becomes the smallest
-            steps = (np.log(scale.astype(np.float64)) - LOG_SCALE_LEAST) * LOG_SCALE_STEPS
+            steps = (np.log(scale.astype(np.float64)) - MIN_LOG_SCALE) * LOG_SCALE_STEPS
         columns = (
             positions,
             _byte(255 * opacity),
@@ -104,16 +104,16 @@ def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
 
 def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed: int) -> list[int]:
     """Bytes of the columns, harmonics last; SceneError where a header cannot be right. packed: bytes of the file."""
-    if data != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MOST_FRACTION_BITS:
+    if data != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MAX_FRACTION_BITS:
         raise SceneError(
             f"its header says {data!r}, version {version}, degree {degree}, {bits} fraction bits; expected 'NGSP', "
-            f"version 2 to 4, at most {len(HARMONICS) - 1} and {MOST_FRACTION_BITS}: export it again"
+            f"version 2 to 4, at most {len(HARMONICS) - 1} and {MAX_FRACTION_BITS}: export it again"
         )
     if count == 0:
         raise SceneError("it has 0 splats; expected at least one")
     # Positions, opacity, color, scale, rotation, harmonics.
     sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * HARMONICS[degree] * count]
-    if sum(sizes) > max(PLENTY, MOST_RATIO * packed):
+    if sum(sizes) > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * packed):
         raise SceneError(
             f"it claims {count} splats, {sum(sizes)} bytes, in a file of {packed}: it is made to fill memory"
         )
@@ -138,7 +138,7 @@ def _unpacked(data: bytes) -> tuple[int, int, list[Bytes]]:
 
 
 def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
-    """The same of version 4: a table of bytes packed and bytes, 64 bits each, then the columns."""
+    """As `_unpacked`, for version 4: a table of packed and unpacked sizes, 64 bits each, then the columns."""
     with naming_extra("zstandard", "spz"):
         import zstandard
     if len(data) < HEADER.size + 4:
@@ -154,7 +154,7 @@ def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
         frame = data[start : start + packed]
         start += packed
         try:
-            # Before it is unpacked: whatever size is stated must be the one that follows from the header.
+            # Checked before unpacking: any stated size must be the one that follows from the header.
             if claimed != size or len(frame) < packed or zstandard.frame_content_size(frame) not in (size, -1):
                 raise SceneError(f"column {number} claims {claimed} bytes in {packed}; expected {size}: copy it again")
             column = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(frame, max_output_size=size)
@@ -177,15 +177,15 @@ def _fixed_point(parts: Bytes) -> IntArray:
     """(...) whole numbers with a sign, of three bytes (..., 3) each, the lowest first."""
     # Flipping the sign bit and taking it off again extends the sign from 24 to 32 bits.
     low, middle, high = np.moveaxis(parts.astype(np.int32), -1, 0)
-    return ((low | middle << 8 | high << 16) ^ FIXED_POINT) - FIXED_POINT
+    return ((low | middle << 8 | high << 16) ^ SIGN_BIT) - SIGN_BIT
 
 
 def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
-    """(n, 9) bytes, and how many of their bits are fractions: as many as the coordinate farthest from 0 leaves."""
+    """(n, 9) bytes, and the number of fraction bits: as many as the coordinate farthest from 0 allows."""
     farthest = float(np.abs(xyz).max(initial=0.0))
-    bits = MOST_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((FIXED_POINT - 1) / farthest)))
+    bits = MAX_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((SIGN_BIT - 1) / farthest)))
     extent = float(np.ptp(xyz, axis=0).max(initial=0.0))
-    if bits < 0 or (extent > 0 and 2.0**-bits > COARSEST * extent):
+    if bits < 0 or (extent > 0 and 2.0**-bits > MAX_STEP_SHARE * extent):
         raise SceneError(
             f"positions reach {farthest:.4g} from 0 over an extent of {extent:.4g}, too far or too little for SPZ's 24 "
             "bits: move the splats near 0, take a smaller unit, or write a .ply"
@@ -195,7 +195,7 @@ def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
 
 
 def _three_bytes(rotation: Bytes) -> DoubleArray:
-    """(n, 4) quaternions x y z w of version 2, whose w is what is missing to 1."""
+    """(n, 4) quaternions x y z w of version 2, whose w completes them to length 1."""
     xyz = rotation.reshape(-1, 3) / 127.5 - 1
     return np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1)))])
 
@@ -203,17 +203,17 @@ def _three_bytes(rotation: Bytes) -> DoubleArray:
 def _smallest_three(words: NDArray[np.uint32]) -> DoubleArray:
     """(n, 4) quaternions x y z w: two bits name the largest part, which is positive. The others, at most 1/sqrt(2),
     have nine bits and a sign each; the last one is lowest."""
-    fields = words[:, None] >> PLACES
-    size = (fields & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
+    fields = words[:, None] >> PART_SHIFTS
+    size = (fields & MAX_MAGNITUDE) / MAX_MAGNITUDE * np.sqrt(0.5)
     return from_smallest_three(words >> 30, np.where(fields >> 9 & 1, -size, size))
 
 
 def _packed_rotation(wxyz: DoubleArray) -> NDArray[np.uint32]:
     """(n,) words that `_smallest_three` reads, of unit quaternions with the scene's axes."""
-    xyzw = np.column_stack([wxyz[:, 1:] * TURNED, wxyz[:, 0]])
+    xyzw = np.column_stack([wxyz[:, 1:] * AXIS_SIGNS, wxyz[:, 0]])
     largest = np.abs(xyzw).argmax(axis=1)
     xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)  # -q turns as q does
     others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    size = np.minimum(np.rint(np.abs(others) * np.sqrt(2) * MAGNITUDE), MAGNITUDE).astype(np.uint32)
-    fields = (size | (others < 0).astype(np.uint32) << 9) << PLACES
+    size = np.minimum(np.rint(np.abs(others) * np.sqrt(2) * MAX_MAGNITUDE), MAX_MAGNITUDE).astype(np.uint32)
+    fields = (size | (others < 0).astype(np.uint32) << 9) << PART_SHIFTS
     return (np.bitwise_or.reduce(fields, axis=1) | largest.astype(np.uint32) << 30).astype("<u4")

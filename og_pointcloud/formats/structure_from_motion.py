@@ -1,9 +1,9 @@
 """Photographs without poses -> a COLMAP model with poses and points, through pycolmap (extra 'poses').
 
 COLMAP finds SIFT features, matches pairs and maps incrementally. The choices made here: photographs of one size share a
-lens; every photograph is compared with every other or, if there are more than `ALL_PAIRS`, with its neighbors and some
-of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is arbitrary. Seeds are
-fixed.
+lens; every photograph is compared with every other or, if there are more than `MAX_EXHAUSTIVE`, with its neighbors and
+some of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is arbitrary. Seeds
+are fixed.
 
 Structure from motion fails on bare walls, mirrors, or photographs taken from one spot. Then there is an error, and no
 capture of the few photographs that happened to fit.
@@ -28,16 +28,16 @@ from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import Journal
 
 MODEL_FOLDER = "sparse"
-FEWEST = 3
-"""A model has at least so many photographs."""
-LEAST_SHARE = 0.5
-"""Share of the photographs that must find their place: fewer are a fragment of the scene."""
-ALL_PAIRS = 120
-"""Up to so many photographs all pairs are compared; of more, only pairs among every k-th, at most so many of them."""
+MIN_SIZE = 3
+"""Photographs of a model."""
+MIN_POSED_SHARE = 0.5
+"""Of the photographs: with fewer poses, a model is a fragment of the scene."""
+MAX_EXHAUSTIVE = 120
+"""Up to this many photographs all pairs are compared; else only pairs among every k-th, at most this many of them."""
 NEIGHBORS = 10
-"""Each photograph is in any case compared with so many before and after it."""
-CHUNK = 64
-"""Pairs that COLMAP matches in one call: Ctrl-C and the progress bar wait for its end."""
+"""Each photograph is always compared with this many before and after it."""
+PAIRS_PER_CALL = 64
+"""Small, as Ctrl-C and the progress bar wait for the end of a call of COLMAP."""
 SEED = 0
 CURE = (
     "take more photographs from more places, each sharing two thirds with the next, of textured and still things in "
@@ -100,8 +100,8 @@ def find_poses(
 def _photographs(source: Path, target: Path) -> list[Path]:
     """The files, in the order of their numbers; SceneError where they cannot become a capture in the target."""
     files = numbered_images(source) or numbered_images(source / "images")
-    if len(files) < FEWEST:
-        raise SceneError(f"{source} has {len(files)} photographs; expected {FEWEST} or more, there or in its images/")
+    if len(files) < MIN_SIZE:
+        raise SceneError(f"{source} has {len(files)} photographs; expected {MIN_SIZE} or more, there or in its images/")
     if os.path.lexists(target / MODEL_FOLDER):
         raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
     images = target / "images"
@@ -160,15 +160,17 @@ class _Run:
         options = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=self._threads)
         pairing, verification = colmap.ImportedPairingOptions(), colmap.TwoViewGeometryOptions()
         pairing.match_list_path, verification.ransac.random_seed = self._pairs_file, SEED
-        for start in self._journal.steps(range(0, len(pairs), CHUNK), "matches"):
-            lines = (f"{self._names[a]} {self._names[b]}\n" for a, b in pairs[start : start + CHUNK])
+        for start in self._journal.steps(range(0, len(pairs), PAIRS_PER_CALL), "matches"):
+            lines = (f"{self._names[a]} {self._names[b]}\n" for a, b in pairs[start : start + PAIRS_PER_CALL])
             self._pairs_file.write_text("".join(lines))
             colmap.match_image_pairs(self._database, options, pairing, verification, colmap.Device.cpu)
 
     def _map(self) -> Any:
         colmap = self._colmap
         colmap.set_random_seed(SEED)
-        options = colmap.IncrementalPipelineOptions(num_threads=self._threads, random_seed=SEED, min_model_size=FEWEST)
+        options = colmap.IncrementalPipelineOptions(
+            num_threads=self._threads, random_seed=SEED, min_model_size=MIN_SIZE
+        )
         options.mapper.random_seed = options.triangulation.random_seed = SEED
         steps = iter(self._journal.steps(range(len(self._names)), "mapping"))
         models = colmap.incremental_mapping(
@@ -180,7 +182,7 @@ class _Run:
 
 def _pairs(count: int) -> list[tuple[int, int]]:
     """Numbers of the photographs that are compared with each other."""
-    step = max(1, -(-count // ALL_PAIRS))
+    step = max(1, -(-count // MAX_EXHAUSTIVE))
     return [
         (first, second)
         for first in range(count)
@@ -191,7 +193,7 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 def _require_enough(model: Any, files: Sequence[Path]) -> None:
     registered = 0 if model is None else model.num_reg_images()
-    if registered < max(FEWEST, LEAST_SHARE * len(files)):
+    if registered < max(MIN_SIZE, MIN_POSED_SHARE * len(files)):
         raise SceneError(
             f"{registered} of {len(files)} photographs found their place; expected half of them at least: {CURE}"
         )

@@ -1,4 +1,4 @@
-"""What the geometry formats share: rows of text, columns that become positions and colors, errors' paths."""
+"""What the geometry formats share: rows of text, columns of positions and colors, paths in errors."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 
 
 def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Rows as CSV under the names that any of them has; text that a spreadsheet would take for a formula gets a quote
-    mark before it."""
+    """Rows as CSV with the union of their names as columns; text that a spreadsheet would take for a formula gets a
+    quote mark before it."""
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
     writer.writeheader()

@@ -1,6 +1,5 @@
 """From photographs to masks and mask features: proposers, encoders, and the work that fills a capture folder.
 
-A proposer says where things are in an image, an encoder says in the words' feature space what a mask shows. Models of
-the user's, OpenCV, files and callables stand behind the two protocols of ``contracts``; ``levels`` settles masks
-that overlap.
+A proposer says where things are in an image; an encoder describes what a mask shows, in the words' feature space.
+Users' models, OpenCV, files and callables implement the two protocols of ``contracts``; ``levels`` resolves overlaps.
 """

@@ -1,8 +1,8 @@
-"""Masks of everything in an image, by a model that answers point prompts: it is asked at a grid of points, and of its
-answers the good ones are kept, each once.
+"""Masks of everything in an image, by a model that takes point prompts: it is prompted on a grid, and the good
+masks are kept, without duplicates.
 
-After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of masks
-with nearly the same box the best stays, small holes are filled and small islands removed.
+As in segment-anything's automatic generator, masks with a low predicted IoU or an unstable border are dropped, the best
+of masks with nearly the same box stays, small holes are filled and small islands removed.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ Masks = NDArray[np.bool_]
 
 
 class PointPredictor(Protocol):
-    """A segment-anything model, whatever runs it. Coordinates are pixels of the image, x before y."""
+    """A segment-anything model in any framework. Coordinates are pixels of the image, x before y."""
 
     def set_image(self, image: NDArray[np.uint8]) -> None:
         """Encode (H, W, 3) uint8 RGB, once for all prompts."""
         ...
 
     def at_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """points (k, 2) -> logits (k, m, h, w) of the m masks that each may mean, at the model's own size without
-        padding, so that they cover the image; and predicted IoU (k, m)."""
+        """points (k, 2) -> logits (k, m, h, w) of m candidate masks each, at the model's own size without padding, so
+        that they cover the image; and predicted IoU (k, m)."""
         ...
 
 
@@ -38,9 +38,9 @@ class AutomaticMasks:
     """A proposer around a `PointPredictor`.
 
     points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: a mask below either is dropped.
-    stability_offset: logits by which the border is moved. same_box: two masks whose boxes' IoU is more are one.
-    speck_share: holes and islands of a smaller share of the image go. Defaults are segment-anything's, which removes no
-    specks.
+    stability_offset: logits by which the border is moved. same_box: masks whose boxes have a larger IoU are duplicates.
+    speck_share: smaller holes and islands are removed, a share of the image. Other defaults are segment-anything's,
+    which removes no specks.
     """
 
     predictor: PointPredictor
@@ -58,19 +58,19 @@ class AutomaticMasks:
         points = grid(self.points_per_side, width, height)
         self.predictor.set_image(image)
         batches = (points[first : first + self.batch] for first in range(0, len(points), self.batch))
-        kept = [self._good(*self.predictor.at_points(batch)) for batch in batches]
+        kept = [self._accepted(*self.predictor.at_points(batch)) for batch in batches]
         logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
-        # Duplicates go while masks are small: most prompts find a thing that others found too.
-        best = best_of_alike(logits > 0, scores, self.same_box)
+        # Duplicates are removed while masks are small: most prompts find a thing that others found too.
+        best = suppress_duplicates(logits > 0, scores, self.same_box)
         masks = np.zeros((len(best), height, width), np.bool_)
         for mask, chosen in zip(masks, best, strict=True):
             full = require_cv2().resize(logits[chosen], (width, height), interpolation=require_cv2().INTER_LINEAR)
             mask[:] = without_specks(full > 0, round(self.speck_share * width * height))
-        kept_whole = best_of_alike(masks, scores[best], self.same_box)  # again: specks had made boxes larger
+        kept_whole = suppress_duplicates(masks, scores[best], self.same_box)  # again: specks had enlarged boxes
         return Proposals(masks[kept_whole], scores[best][kept_whole])
 
-    def _good(self, logits: FloatArray, iou: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Those of the answers (k, m, h, w) and (k, m) to a batch that are good: (n, h, w), and their scores (n,)."""
+    def _accepted(self, logits: FloatArray, iou: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The accepted masks (n, h, w) of a batch's logits (k, m, h, w) and IoU (k, m), and their scores (n,)."""
         logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
         good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
         good[good] = stability(logits[good], self.stability_offset) >= self.least_stability
@@ -78,7 +78,7 @@ class AutomaticMasks:
 
 
 def grid(per_side: int, width: int, height: int) -> FloatArray:
-    """(per_side^2, 2) points x, y in the middles of equal cells."""
+    """(per_side^2, 2) points x, y at the centers of equal cells."""
     at = (np.arange(per_side) + 0.5) / per_side
     return np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
 
@@ -90,12 +90,12 @@ def stability(logits: FloatArray, offset: float) -> FloatArray:
     return (strict / np.maximum(lax, 1)).astype(np.float32)
 
 
-def best_of_alike(masks: Masks, scores: FloatArray, same: float) -> NDArray[np.intp]:
-    """Non-maximum suppression of masks (n, h, w) by their boxes: indices, best score first, of those with a score above
-    0 whose box has an IoU above ``same`` with that of no better one."""
+def suppress_duplicates(masks: Masks, scores: FloatArray, max_iou: float) -> NDArray[np.intp]:
+    """Non-maximum suppression of masks (n, h, w) by their boxes: indices, best score first, of masks with a score above
+    0 whose box has no IoU above ``max_iou`` with a better one's."""
     cv2 = require_cv2()
     boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks]
-    return np.array(cv2.dnn.NMSBoxes(boxes, scores.tolist(), 0.0, same), np.intp).reshape(-1)
+    return np.array(cv2.dnn.NMSBoxes(boxes, scores.tolist(), 0.0, max_iou), np.intp).reshape(-1)
 
 
 def without_specks(mask: Masks, smallest_px: int) -> Masks:

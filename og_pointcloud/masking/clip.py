@@ -15,24 +15,24 @@ from og_pointcloud.masking.pretrained import Attention, best_device, load_pretra
 from og_pointcloud.models import MODEL_NAME
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
-"""config.json's model_type -> transformers' class of it."""
-CLIP_COLORS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-SIGLIP_COLORS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
-"""Means and standard deviations that the published models were trained with."""
+"""config.json's model_type -> transformers' class."""
+CLIP_MEAN_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+SIGLIP_MEAN_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+"""Means and standard deviations of RGB that the published models were trained with."""
 PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
 
 
 def load_model(folder: StrPath, attention: Attention = "sdpa") -> Any:
-    """A CLIP or SigLIP (SigLIP 2 of fixed size is one) of `pretrained.load_pretrained`."""
+    """A CLIP or SigLIP (also SigLIP 2 of fixed size) by `pretrained.load_pretrained`."""
     return load_pretrained(Path(folder), CLASSES, attention)[0]
 
 
 class ImageTower(torch.nn.Module):
     """Pixels (B, 3, h * patch, w * patch) float32 -> unit vectors of images (B, D) and of their patches (B, h, w, D).
 
-    A model gathers an image into one vector where its tokens attend to each other for the last time: CLIP in its last
-    layer, by the class token; SigLIP in its head, by a probe. For the vectors of patches, each patch attends there to
-    itself alone, so that its own value comes out, in the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai,
+    A model pools an image into one vector in its last attention: CLIP in its last layer, by the class token; SigLIP in
+    its head, by a probe. For the vectors of patches, each patch there attends to itself alone, which yields its own
+    value, in the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai,
     ECCV 2022), section 3.2.
     """
 
@@ -66,7 +66,7 @@ def _unit(vectors: torch.Tensor) -> torch.Tensor:
 
 
 class TransformersModel:
-    """A CLIP or SigLIP as an `contracts.ImageModel`; on a GPU where torch has one."""
+    """A CLIP or SigLIP as a `contracts.ImageModel`; on a GPU where torch has one."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class TransformersModel:
         crops: tuple[Crop, ...] = WITH_CONTEXT,
         attention: Attention = "sdpa",
     ) -> None:
-        """feature_space: None for what the folder's configuration says. Errors: as ``load_model``."""
+        """feature_space: None: as the folder's configuration states it. Errors: as ``load_model``."""
         self.feature_space = feature_space or published_name(folder)
         model = load_model(folder, attention)
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
@@ -99,7 +99,7 @@ class TransformersModel:
 
 
 def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
-    """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
+    """As preprocessor_config.json states it, else as the family's published models have it. config: the model's."""
     stated = read_config(Path(folder), "preprocessor_config.json")
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
@@ -107,14 +107,13 @@ def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
             f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
-    # What the folder does not state is as in the published models of its family.
-    mean, std = CLIP_COLORS if config.model_type == "clip" else SIGLIP_COLORS
+    mean, std = CLIP_MEAN_STD if config.model_type == "clip" else SIGLIP_MEAN_STD
     mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
     return Preprocessing(config.vision_config.image_size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number])
 
 
 def published_name(folder: StrPath) -> str:
-    """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
+    """OWNER/MODEL from a model's configuration; OgPointcloudError where it has none."""
     name = read_config(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
         raise OgPointcloudError(

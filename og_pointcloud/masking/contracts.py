@@ -16,15 +16,15 @@ from og_pointcloud.masking.crops import Crop, Preprocessing
 FEATURES = ("crops", "dense")
 """How the encoder is shown a mask."""
 LEVELS = ("small", "medium", "large")
-"""How much one mask covers, as LangSplat calls it: SAM's subparts, parts and wholes."""
+"""How much one mask covers, in LangSplat's terms: SAM's subparts, parts and wholes."""
 
 
 @dataclass(frozen=True)
 class Proposals:
     """Masks of one image; they may overlap, and contain one another.
 
-    masks: (M, H, W) bool. scores: (M,) float32 in [0, 1], how much the proposer trusts each; what no model scored is 1.
-    tracks: (M,) int64, from a tracker: one number for what it takes for one thing in all images, -1 unknown.
+    masks: (M, H, W) bool. scores: (M,) float32 in [0, 1], the proposer's confidence, 1 where no model scored them.
+    tracks: (M,) int64, from a tracker: one number in all images for what it takes for one thing, -1 unknown.
     """
 
     masks: NDArray[np.bool_]
@@ -49,7 +49,7 @@ class MaskProposer(Protocol):
     """Where things are in an image."""
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
-        """image: (H, W, 3) uint8 RGB. No thing found is a Proposals of length 0, not an error."""
+        """image: (H, W, 3) uint8 RGB. Returns Proposals of length 0, not an error, where it finds nothing."""
         ...
 
 
@@ -70,8 +70,8 @@ class MaskEncoder(Protocol):
 class ImageModel(Protocol):
     """Squares of pixels -> vectors.
 
-    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side, in
-    pixels, of the patches that it also gives vectors of; None where it gives none.
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
+    patches that it can also encode, pixels; None where it cannot.
     """
 
     feature_space: str
@@ -85,19 +85,19 @@ class ImageModel(Protocol):
         ...
 
     def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), of a model with a patch."""
+        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), for a model with a patch."""
         ...
 
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """How masks are made. A run with other settings takes up nothing of an earlier one.
+    """How masks are made. A run with other settings reuses nothing of an earlier one.
 
     proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with zero features.
-    level: small, medium or large (`levels.PREFERENCE`).
-    features: crops, a few runs of the encoder a mask; or dense, one an image, coarser (`masking/dense.py`).
+    level: small, medium or large (`levels.PARTS_WEIGHT`).
+    features: crops, a few encoder runs per mask; or dense, one per image, coarser (`masking/dense.py`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
-    every: every so many-th image is used.
+    every: every n-th image is used.
     words: what to look for, with a proposer that takes words (`sam3`).
     tracks: things are followed from image to image, in the order of the pose file. With a folder of id PNGs: an id
         means the same thing in all images, as video trackers write them.
@@ -119,7 +119,7 @@ class MaskSettings:
             raise OgPointcloudError(f"features are '{self.features}' without an encoder; expected one, or crops")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
-        if isinstance(self.words, str):  # which would be a word for each of its letters
+        if isinstance(self.words, str):  # would be read as a word per letter
             raise OgPointcloudError(f"words are {self.words!r:.60}; expected a tuple of them, as ({self.words!r:.60},)")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
@@ -128,14 +128,14 @@ class MaskSettings:
 
     @property
     def folder(self) -> Path | None:
-        """The folder of masks that stands in place of a proposer's name; None for a proposer."""
+        """The folder of masks, where one is given instead of a proposer's name; else None."""
         folder = Path(self.proposer)
-        # Whoever has a clone of OpenCV beside the capture does not mean it.
+        # A folder called opencv, such as a clone, is not meant.
         return folder if self.proposer != "opencv" and folder.is_dir() else None
 
     @property
     def threads(self) -> int:
-        """Images worked on side by side: one a core, but only one with models, which fill memory and cores
+        """Images processed in parallel: one per core, but only one with models, which fill memory and cores
         themselves."""
         light = (self.proposer == "opencv" or self.folder) and self.encoder in (None, "demo")
         return (os.cpu_count() or 1) if light else 1

@@ -1,8 +1,8 @@
-"""Square cut-outs of an image, one a mask, and their pixels as the numbers that an image encoder takes.
+"""Square cut-outs of an image, one per mask, and their pixels as an image encoder takes them.
 
-LangSplat's cut-out is the mask's tight box with black outside the mask, padded to a square. Better ones show where the
-thing stands: a larger window, and outside the mask a blend of the image with an even color, so that the encoder sees
-the chairs around a table, and still which of them is meant. The encoder weights several of them into one vector.
+LangSplat's cut-out is the mask's tight box with black outside the mask, padded to a square. Better ones show the
+thing's surroundings: a larger window, and outside the mask a blend of the image with a uniform color, so that the
+encoder sees the chairs around a table, and still which thing is meant. Several are weighted into one vector.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CROP_STYLES = {"langsplat": LANGSPLAT, "context": WITH_CONTEXT}
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How squares of an image become what an image model takes.
+    """How squares of an image become the input of an image model.
 
     size: of the square, pixels. mean, std: RGB, of values in [0, 1].
     """
@@ -68,13 +68,13 @@ class Preprocessing:
 
     @classmethod
     def from_manifest(cls, entry: Mapping[str, Any]) -> Preprocessing:
-        """From the fields as JSON has them; TypeError for others."""
+        """From a JSON object's fields; TypeError for unknown ones."""
         known = {name: value for name, value in entry.items() if name != "keeps_shape"}  # of earlier exports, unused
         return cls(**{**known, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
 
     @property
     def fill(self) -> tuple[int, int, int]:
-        """The color that becomes zero, or nearly, and so says nothing to the model."""
+        """The color that becomes zero, or nearly, and so carries no information."""
         red, green, blue = (round(255 * value) for value in self.mean)
         return red, green, blue
 
@@ -101,12 +101,12 @@ def mask_crops(
     """
     require_masks(image, masks)
     pillow = require_pillow()
-    # The whole image as it is shown outside of masks: made once, not for every mask.
+    # The whole image as it looks outside masks: made once, not for every mask.
     faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(np.uint8)
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):
         square = _square(image, faded, mask, crop.scale, fill)
-        # Pillow's filters, as the models' own processors: they smooth what they shrink, OpenCV's do not.
+        # Pillow's filters, as in the models' own processors, smooth when shrinking; OpenCV's do not.
         resized = pillow.fromarray(square).resize((size, size), pillow.Resampling[resample.upper()])
         crops[row] = np.asarray(resized)
     return crops
@@ -126,7 +126,7 @@ def require_masks(image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> None:
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """(top, left, height, width) of the smallest box with all of a mask's pixels, of which there is one at least."""
+    """(top, left, height, width) of the smallest box around all pixels of a mask, which has at least one."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return int(rows[0]), int(columns[0]), int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 

@@ -1,9 +1,8 @@
 """A mask's vector from one run of the encoder on the whole image: the mean of its patches. Faster than crops, coarser.
 
 Crops show the encoder each mask by itself, in several runs a mask. Here it sees the image once, and a mask's vector is
-the mean of the vectors of its patches, each weighted by how much of it the mask covers. Vectors of patches, that tell
-what a patch shows and not what the image is about, are made as in MaskCLIP (Zhou, Loy and Dai, ECCV 2022): see
-`clip.ImageTower`.
+the mean of its patches' vectors, each weighted by how much of the patch the mask covers. Patch vectors that describe
+the patch rather than the whole image are made as in MaskCLIP (Zhou, Loy and Dai, ECCV 2022): see `clip.ImageTower`.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import require_masks
 
-SHORTER_SIDE = 2.0
+SHORTER_SIDE_SCALE = 2.0
 """The image's shorter side, in sides of the square that the model was trained on. With CLIP B/16 it then spans 28
 patches instead of 14; their position embeddings are interpolated."""
 
@@ -39,7 +38,7 @@ class DenseEncoder(MaskEncoder):
         found = self.model.patches(self._pixels(image))
         height, width = found.shape[:2]
         shares = [_shares(mask, width, height) for mask in masks]
-        # Weighted sums in place of means: the length goes at the end anyway.
+        # Weighted sums instead of means: they are normalized at the end anyway.
         total = np.stack(shares).reshape(len(masks), -1) @ found.reshape(-1, self.width)
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
@@ -48,7 +47,7 @@ class DenseEncoder(MaskEncoder):
         before, pillow = self.model.preprocessing, require_pillow()
         # Both sides by one scale, then each to its nearest whole patch: models were trained on squares, but a squeezed
         # image would show squeezed things.
-        scale = SHORTER_SIDE * before.size / min(image.shape[:2])
+        scale = SHORTER_SIDE_SCALE * before.size / min(image.shape[:2])
         height, width = (max(1, round(side * scale / self.patch)) * self.patch for side in image.shape[:2])
         resized = pillow.fromarray(image).resize((width, height), pillow.Resampling[before.resample.upper()])
         return before.pixels(np.asarray(resized)[None])

@@ -1,4 +1,4 @@
-"""Mask encoders: what a mask shows, as a vector in the space into which a text encoder of the same name puts words.
+"""Mask encoders: what a mask shows, as a vector in the feature space of the text encoder of the same name.
 
 ``open_encoder`` opens three kinds:
 
@@ -8,9 +8,9 @@
                         graph, parity figures against torch
     image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows; where the manifest has a patch,
                         pixels (B, 3, h * patch, w * patch), and -> patches (B, h, w, D) float32, unit vectors, too
-- "demo", such a folder that comes with the library; it knows the things of the procedural room and nothing else.
+- "demo", such a folder that comes with the library; it knows only the things of the procedural room.
 
-A folder may come from a stranger, so it is checked before its graph is run: nothing is unpickled, no code of its own
+A folder may come from a stranger, so it is checked before its graph is run: nothing is unpickled, and none of its code
 runs.
 """
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 DEMO_SPACE = "og_pointcloud/demo-room-encoder"
-"""Feature space of the demo encoder, which knows the procedural room's things and nothing else of the world."""
+"""Feature space of the demo encoder, which knows only the things of the procedural room."""
 DEMO_FOLDER = Path(__file__).parent / "demo_encoder"
 """Its two halves: ``image`` and ``text``."""
 GRAPH = "image_encoder.onnx"
@@ -49,7 +49,7 @@ OPERATORS = frozenset({
 """The operators that an encoder's graph may have: arithmetic, without loops, random numbers or graphs inside nodes."""
 ENCODER = EncoderFormat("og-image-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
-"""Bounds memory: a run of a large model holds some 100 MB a crop."""
+"""Bounds memory: a large model takes some 100 MB per crop."""
 
 
 def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
@@ -58,7 +58,7 @@ def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
     name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
         needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
         what Hugging Face's own tools have fetched.
-    features: "crops", a few runs of the model a mask (`CropEncoder`), or "dense", one an image (`dense.DenseEncoder`).
+    features: "crops", a few model runs per mask (`CropEncoder`), or "dense", one per image (`dense.DenseEncoder`).
     Raises OgPointcloudError where there is no such encoder, and where a model has no patches, which "dense" needs.
     """
     model = _open_model(name)
@@ -75,7 +75,7 @@ def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
 def _open_model(name: StrPath) -> ImageModel:
     if name == "demo":
         return OnnxModel(DEMO_FOLDER / "image")
-    # A folder by its path, then by the feature space that it says it is of, then what other tools have fetched.
+    # A folder by its path, then by its stated feature space, then what other tools have fetched.
     path = Path(name).expanduser()
     if path.exists():
         return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path)
@@ -121,7 +121,7 @@ class CropEncoder(MaskEncoder):
 
     def _vectors(self, image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDArray[np.float32]:
         before = self.model.preprocessing
-        # LangSplat's black outside is a color to the model, and part of its way to cut. A blend should fade to nothing.
+        # LangSplat's crops are black outside, which is a color to the model. A blend should fade to no information.
         fill = before.fill if crop.outside else (0, 0, 0)
         return self.model(before.pixels(mask_crops(image, masks, crop, before.size, fill, before.resample)))
 

@@ -1,4 +1,4 @@
-"""Masks that exist already: id images, COCO annotations, and what a function of the user's returns."""
+"""Masks that exist already: id images, COCO annotations, and what a user's function returns."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
 MAX_MASKS_PX = 1 << 33
-"""Pixels of all masks of one image together: more is refused before memory is taken for them."""
+"""Pixels of all masks of one image together: more are refused before allocation."""
 
 
 def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> Proposals:
     """An id map (H, W) as proposals of score 1, by ascending id. none: the id outside every mask. tracks: whether ids
-    are those of tracks."""
+    are track numbers."""
     # Ids may be any numbers, with gaps: only those that occur become masks.
     names = np.unique(ids)
     names = names[names != none]
@@ -35,10 +35,10 @@ def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> P
 
 
 def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
-    """What a function of the user's returned, as proposals for an image of ``shape`` (H, W).
+    """What a user's function returned, as proposals for an image of ``shape`` (H, W).
 
-    It may return Proposals; bool (M, H, W), which get the score 1; or an id map of integers (H, W), negative outside
-    every mask, or, if nothing is negative, 0 outside.
+    It may return Proposals; bool (M, H, W), which get the score 1; or an integer id map (H, W), negative outside every
+    mask, or 0 if nothing is negative.
     """
     masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
     if masks.shape[-2:] != shape:
@@ -57,27 +57,27 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
 
 @dataclass(frozen=True)
 class CallableProposer:
-    """A function of the user's, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer. name: of the
-    function, for errors."""
+    """A user's function, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer. name: the function's,
+    for errors."""
 
     function: Callable[[NDArray[np.uint8]], Any]
     name: str
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
-        """SceneError where the function fails, or gives something else."""
+        """SceneError where the function fails, or returns something else."""
         height, width = image.shape[:2]
         try:
             given = self.function(image)
         except Exception as error:
             raise SceneError(
-                f"the mask proposer {self.name} failed ({_of_user(error)}): og-pointcloud --debug shows where"
+                f"the mask proposer {self.name} failed ({_user_error(error)}): og-pointcloud --debug shows where"
             ) from error
         return as_proposals(given, (height, width))
 
 
-def own_proposer(place: str) -> MaskProposer:
-    """The proposer ``MODULE:NAME``: a function as `CallableProposer` takes it, an object whose ``propose`` is one, or a
-    class of such, which is called without arguments. SceneError where it is not there.
+def user_proposer(place: str) -> MaskProposer:
+    """The proposer ``MODULE:NAME``: a function for `CallableProposer`, an object whose ``propose`` is one, or a class
+    of such objects, called without arguments. SceneError where there is none.
 
     MODULE is the file ``MODULE.py`` in the working directory (dots are folders), else a module that Python finds. The
     import path stays as it is: a file that imports its neighbors needs their folder in PYTHONPATH.
@@ -86,12 +86,12 @@ def own_proposer(place: str) -> MaskProposer:
     if not name or not all(part.isidentifier() for part in module.split(".")):
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
-        file = own_file(place)
+        file = user_file(place)
         # A file is run by its path, not imported: one called numpy.py does not take numpy's place.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
     except Exception as error:  # whatever running the module may raise
         raise SceneError(
-            f"no proposer 'python:{place}' ({_of_user(error)}); expected a name in {module}.py here, or in an "
+            f"no proposer 'python:{place}' ({_user_error(error)}); expected a name in {module}.py here, or in an "
             "installed module"
         ) from error
     made = found() if isinstance(found, type) else found
@@ -100,12 +100,12 @@ def own_proposer(place: str) -> MaskProposer:
     raise SceneError(f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose")
 
 
-def own_file(place: str) -> Path:
+def user_file(place: str) -> Path:
     """Where the file of ``MODULE:NAME`` would be."""
     return Path(f"{place.partition(':')[0].replace('.', '/')}.py")
 
 
-def _of_user(error: Exception) -> str:
+def _user_error(error: Exception) -> str:
     return f"{type(error).__name__}: {first_line(error)}"
 
 
@@ -122,13 +122,13 @@ class ExistingMasks:
 
     def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
-        # Files of the image's own come before files of all images.
+        # The image's own files come before files for all images.
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
             return _resized(from_ids(read_ids(png), none=-1, tracks=self.tracks), shape)
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
-        # Views are called by their stems, or by paths below a folder that COCO's paths may begin with.
+        # Views are named by stem, or by a path below a folder that may be part of COCO's paths.
         alike = self._coco.get(image_name.rsplit("/", 1)[-1], {})
         named = [path for path in alike if f"/{path}".endswith(f"/{image_name}")] or [*alike]
         if len(named) == 1:
@@ -145,14 +145,14 @@ class ExistingMasks:
 
     @cached_property
     def _coco(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
-        """Annotations by the stem of their image, and its path without suffix, each with the image's size, from all
-        COCO files of the folder."""
+        """Annotations by their image's stem and path without suffix, each with the image's size, from all COCO files of
+        the folder."""
         found: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for file in sorted(self.folder.glob("*.json")):
             content = read_json(file, MAX_JSON_BYTES)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
-            # COCO lists images and annotations apart; polygons need the size of their image.
+            # COCO lists images and annotations separately; polygons need their image's size.
             images: dict[Any, tuple[list[dict[str, Any]], list[Any]]] = {}
             for image in content["images"]:
                 known = isinstance(image, dict) and isinstance(image.get("id"), (int, str, type(None)))
@@ -202,8 +202,8 @@ def _size(size: Any, source: str) -> tuple[int, int]:
 
 def _decompressed(text: str | bytes, source: str) -> list[int]:
     """Run lengths from COCO's text (cocoapi, maskApi.c, rleToString). A character, less 48, has six bits: five of the
-    number, the lowest first, and a sixth that says that more follow; the fifth bit of the last one is the sign. From
-    the fourth run on, numbers are differences to the run two before."""
+    number, lowest first, and a sixth set if more follow; the fifth bit of the last one is the sign. From the fourth run
+    on, numbers are differences to the run two before."""
     data = text.encode("latin-1", "replace") if isinstance(text, str) else text
     runs: list[int] = []
     value = shift = 0
@@ -231,7 +231,7 @@ def _annotations(found: Any) -> list[dict[str, Any]]:
 
 
 def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Proposals | None:
-    """The masks of annotations of one image; None where there are none, as nothing says how large they would be."""
+    """The masks of one image's annotations; None where there are none, as their size is then unknown."""
     masks, scores = [], []
     for index, annotation in enumerate(annotations):
         where = f"{source}, annotation {index}"
@@ -249,7 +249,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Pro
 
 
 def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
-    """The mask inside of rings of x, y in pixels. size: [height, width]."""
+    """The mask inside rings of x, y in pixels. size: [height, width]."""
     drawn = np.zeros(_size(size, source), np.uint8)
     for ring in polygons:
         try:
@@ -263,11 +263,11 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
 
 
 def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
-    """Masks at the size of the image that they are used on, nearest pixel."""
+    """Masks at the size of their image, by nearest pixel."""
     if proposals is None or not len(proposals):
         return Proposals(np.zeros((0, *shape), np.bool_), np.zeros(0, np.float32))
     height, width = proposals.masks.shape[1:]
-    # The pixel that holds the middle of each pixel of the new size.
+    # The old pixel that contains the center of each new pixel.
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
     masks = proposals.masks[:, rows.astype(np.int64)[:, None], columns.astype(np.int64)]

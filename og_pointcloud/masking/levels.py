@@ -1,12 +1,12 @@
-"""Overlapping proposals -> one id map, on a level: small, medium or large.
+"""Overlapping proposals -> one id map at a level: small, medium or large.
 
-Of proposals that nearly coincide, the best scored stays. A mask that lies inside another is its child: so they form a
+Of proposals that nearly coincide, the best scored stays. A mask that lies inside another is its child, so masks form a
 forest. A level is a cut through the forest: a mask is used instead of its parts if its value, area times score, is at
-least the value of the best choice among its parts, times what the level asks for (`PREFERENCE`). A level that asks for
-less cuts higher or equally high everywhere, so a small mask lies in a medium one and that in a large one. Where masks
-of one level still overlap, the better scored has the pixels.
+least the best total value of its parts, times the level's `PARTS_WEIGHT`. A smaller weight cuts higher or equally high
+everywhere, so a small mask lies in a medium one and that in a large one. Where masks of one level still overlap, the
+better scored one takes the pixels.
 
-Everything is counted on atoms, the sets of pixels with the same masks over them: exact, and independent of the image's
+Everything is computed on atoms, the sets of pixels covered by the same masks: exact, and independent of the image's
 size after one pass.
 """
 
@@ -18,36 +18,36 @@ from numpy.typing import NDArray
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.scene import DoubleArray, IntArray
 
-PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
-"""Level -> weight of the value of a mask's parts beside its own: more prefers parts, less prefers wholes."""
-SAME = 0.8
-"""Two masks whose intersection over union is more are one."""
-INSIDE = 0.9
-"""A mask of which more than this share lies in a larger one is its child."""
-VISIBLE = 0.3
-"""A mask of which better ones leave less than this share is left out."""
+PARTS_WEIGHT = {"small": 1.6, "medium": 1.0, "large": 0.6}
+"""Level -> weight of the value of a mask's parts against its own: more prefers parts, less prefers wholes."""
+SAME_IOU = 0.8
+"""Two masks with a larger IoU are one."""
+INSIDE_SHARE = 0.9
+"""A mask with more than this share of its area in a larger one is its child."""
+VISIBLE_SHARE = 0.3
+"""A mask of which better ones leave less than this share visible is dropped."""
 
 
-def settled(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[np.intp]]:
-    """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first; and
-    (K,) the proposal that each id is."""
+def masks_of_level(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[np.intp]]:
+    """(H, W) int32: -1 outside every mask of this level of `PARTS_WEIGHT`, else 0..K-1, the best scored mask first; and
+    (K,) the proposal of each id."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
-    order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
+    order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # better first, then smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
-    # (M, M) pixels that each two masks share; on the diagonal the area of each.
+    # (M, M) pixels that each pair of masks shares; on the diagonal the area of each.
     shared_px = (member * area_px) @ member.T.astype(np.float64)
     kept = _distinct(shared_px)
     member, scores, shared_px = member[kept], scores[kept], shared_px[np.ix_(kept, kept)]
-    used = _cut(np.diag(shared_px), scores, _parents(shared_px), PREFERENCE[level])
-    # Ids 0..K-1 of the masks that own an atom, best first, as masks are in that order.
+    used = _cut(np.diag(shared_px), scores, _parents(shared_px), PARTS_WEIGHT[level])
+    # Ids 0..K-1 of the masks that own an atom, best first, as masks are ordered.
     shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
-    ids = ids - (shown[:1] < 0).sum()  # -1, where there is one, is the first of the owners
+    ids = ids - (shown[:1] < 0).sum()  # -1, if present, is the first owner
     return ids.astype(np.int32)[atom_of_pixel], order[kept][shown[shown >= 0]]
 
 
 def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], DoubleArray]:
-    """(H, W) the atom of each pixel; (M, atoms) which masks cover each atom; (atoms,) its pixels."""
-    # Each mask is a random number, a set of masks their sum: two sets have one sum once in 2^63 draws or so.
+    """(H, W) the atom of each pixel; (M, atoms) which masks cover each atom; (atoms,) its area in pixels."""
+    # Each mask is a random number, a set of masks their sum: two sets collide once in 2^63 draws or so.
     rng = np.random.default_rng(0)
     signature = np.zeros(masks.shape[1:], np.uint64)
     for mask in masks:
@@ -58,12 +58,12 @@ def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_
 
 
 def _distinct(shared_px: DoubleArray) -> NDArray[np.intp]:
-    """Rows of the masks, which are best first, without empty ones and those that nearly coincide with one before."""
+    """Rows of the masks, best first, without empty ones and those that nearly coincide with an earlier one."""
     area_px = np.diag(shared_px)
     kept: list[int] = []
     for mask in np.flatnonzero(area_px > 0).tolist():
         shared = shared_px[mask, kept]
-        if not (shared > SAME * (area_px[mask] + area_px[kept] - shared)).any():
+        if not (shared > SAME_IOU * (area_px[mask] + area_px[kept] - shared)).any():
             kept.append(mask)
     return np.array(kept, np.intp)
 
@@ -73,24 +73,23 @@ def _parents(shared_px: DoubleArray) -> NDArray[np.intp]:
     area_px = np.diag(shared_px)
     parent = np.full(len(area_px), -1)
     for mask, area in enumerate(area_px):
-        around = np.flatnonzero((shared_px[mask] > INSIDE * area) & (area_px > area))
-        if len(around):
-            parent[mask] = around[np.argmin(area_px[around])]
+        containers = np.flatnonzero((shared_px[mask] > INSIDE_SHARE * area) & (area_px > area))
+        if len(containers):
+            parent[mask] = containers[np.argmin(area_px[containers])]
     return parent
 
 
-def _cut(area_px: DoubleArray, scores: DoubleArray, parent: NDArray[np.intp], preference: float) -> NDArray[np.intp]:
-    """The masks of one level, best first: none lies inside another in the forest. A whole that ties with its parts is
-    used."""
-    # parts: best value that a mask's children can make together. Children come first, as they are smaller.
+def _cut(area_px: DoubleArray, scores: DoubleArray, parent: NDArray[np.intp], parts_weight: float) -> NDArray[np.intp]:
+    """The masks of one level, best first: none lies inside another in the forest. A whole wins a tie with its parts."""
+    # parts: best total value of a mask's children. Children come first, as they are smaller.
     value, parts = area_px * scores, np.zeros(len(parent))
     used = np.zeros(len(parent), bool)
     upwards = np.argsort(area_px, kind="stable")  # a parent is larger
     for mask in upwards:
-        used[mask] = value[mask] >= preference * parts[mask]
+        used[mask] = value[mask] >= parts_weight * parts[mask]
         if parent[mask] >= 0:
-            parts[parent[mask]] += max(value[mask], preference * parts[mask])
-    # From the roots down: nothing inside of a mask that is used is used, too.
+            parts[parent[mask]] += max(value[mask], parts_weight * parts[mask])
+    # From the roots down: nothing inside a used mask is used.
     covered = np.zeros(len(parent) + 1, bool)  # the last entry serves roots, whose parent is -1
     for mask in upwards[::-1]:
         used[mask] &= not covered[parent[mask]]
@@ -101,8 +100,8 @@ def _cut(area_px: DoubleArray, scores: DoubleArray, parent: NDArray[np.intp], pr
 def _owners(member: NDArray[np.bool_], area_px: DoubleArray, used: NDArray[np.intp]) -> NDArray[np.intp]:
     """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
     owner = np.full(member.shape[1], -1)
-    for mask in used[::-1]:  # the best last, so that it has what it shares
+    for mask in used[::-1]:  # the best last, so that it takes shared atoms
         owner[member[mask]] = mask
     shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
-    hidden = shown_px < VISIBLE * (member @ area_px)
+    hidden = shown_px < VISIBLE_SHARE * (member @ area_px)
     return np.where(np.append(hidden, False)[owner], -1, owner)  # the last entry serves -1

@@ -1,9 +1,9 @@
 """Photographs -> masks and mask features in a capture folder: resumable, nothing half-written.
 
-The masks of each image are first a file of its own in ``masks.work/``, written whole or not at all. When all are there
-they become ``masks/`` with ``mask_features.npz``, and ``masks.work/`` goes. Killed at any moment, the same command goes
-on after the last image that was done; where everything is made already it does nothing. ``made.json`` beside the masks
-says that they were made here, and how.
+The masks of each image are first a separate file in ``masks.work/``, written whole or not at all. Once complete, they
+become ``masks/`` with ``mask_features.npz``, and ``masks.work/`` is removed. After a kill at any moment, the same
+command resumes after the last finished image; where everything is made already it does nothing. ``made.json`` beside
+the masks records that they were made here, and how.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
-from og_pointcloud.masking.existing import own_file
+from og_pointcloud.masking.existing import user_file
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
 VERSION = 3
-"""Counts changes of what an image's work file holds; files of another version are made again."""
+"""Of the contents of an image's work file; files of another version are made again."""
 WORK_FOLDER = "masks.work"
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 4
@@ -77,12 +77,12 @@ def make_masks(
     target = capture if output is None else Path(output)
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
-    # Every so many-th image, with all faces of each.
+    # Every n-th image, with all its faces.
     used = set(list(dict.fromkeys(photograph.path for photograph in photographs))[:: settings.every])
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate)
     _refuse_foreign(target, overwrite)
-    # Names of work files hold all that decides what is in them, so that what exists can be used as it is.
+    # Names of work files encode all that determines their contents, so that existing ones can be reused.
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(each, work / f"{_digest([each.name, *_state(each.file)])}.npz") for each in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
@@ -119,16 +119,15 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """A name for settings, and for the masks or the code of the user's that they name: work files of others are not
-    taken up."""
-    of_image = replace(settings, every=1)  # which images are used does not change what one of them gives
+    """A name for settings, and for the user's masks or code that they refer to: work files of others are not reused."""
+    of_image = replace(settings, every=1)  # which images are used does not change the masks of one
     kind, _, place = settings.proposer.partition(":")
-    given = sorted(settings.folder.rglob("*")) if settings.folder else [own_file(place)] if kind == "python" else []
+    given = sorted(settings.folder.rglob("*")) if settings.folder else [user_file(place)] if kind == "python" else []
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
 
 def _state(file: Path) -> tuple[str, int, int]:
-    """Name, size and time of a file: what changes when the file does."""
+    """Name, size and time of a file, which change when the file does."""
     state = file.stat()
     return file.name, state.st_size, state.st_mtime_ns
 
@@ -141,14 +140,14 @@ def _digest(value: list[Any]) -> str:
 
 
 def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Path, progress: bool) -> None:
-    """Do what is not done yet, with a preview after the first images."""
+    """Process the unfinished images, with a preview after the first ones."""
     waiting = [task for task in tasks if not task.work_file.exists()]
     broken, previewed = [], False
     for wrong in with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress):
         if wrong:
             broken.append(wrong)
             warnings.warn(wrong, stacklevel=4)
-        # Wrong masks are seen after the first images, not after a night.
+        # So wrong masks are noticed after the first images, not after a night.
         done = [] if previewed else [task for task in tasks if task.work_file.exists()]
         if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
             shown = [(task.photograph.read(settings.longest_side), task.work_file) for task in done[:PREVIEW_IMAGES]]
@@ -168,7 +167,7 @@ def _refuse_foreign(target: Path, overwrite: bool) -> None:
     """OgPointcloudError where masks or features that were not made here would be replaced, or folders are links."""
     folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
     for link in (folder, target / WORK_FOLDER):
-        if link.is_symlink():  # a stranger's capture could have masks written anywhere by it
+        if link.is_symlink():  # a stranger's capture could redirect masks anywhere by it
             raise OgPointcloudError(
                 f"{link} is a link to '{link.readlink()}'; expected a folder of the capture's own, as nothing is "
                 "written through links: remove it, or give another folder (-o DIR)"
@@ -199,7 +198,7 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
     """Write the capture's files from the work files. Number of masks, and the feature space."""
     folder = target / MASKS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    # First, and without a key: after a kill in here the next run knows the folder as ours, but not as complete.
+    # First, and without a key: after a kill in here the next run recognizes the folder as ours, but incomplete.
     _write_made(target, settings, tasks)
     features: dict[str, Any] = {}
     space, masks = UNKNOWN_SPACE, 0
@@ -217,7 +216,7 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
 
 
 def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:
-    """Write made.json. record: what a run adds at its end."""
+    """Write made.json. record: added at the end of a run."""
     named = {key: _last_part(value) for key, value in asdict(settings).items()}
     made = {"made_by": "og-pointcloud masks", **named, "images": len(tasks), **record}
     write_json(target / MASKS_FOLDER / MADE_NAME, made)

@@ -3,10 +3,10 @@
 1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
    from one surface into another of its color.
 2. Merging: in every round, pairs of neighbors that are each other's nearest become one region. The distance of two
-   regions follows from their mean colors and the contrast along their common border; small regions are nearer to all
-   their neighbors, and so are textured ones.
-3. Proposals: the regions that lasted. A region's score compares the distance at which it was merged away with that at
-   which it was made. Regions overlap only by containing one another; `levels` settles which to use.
+   regions follows from their mean colors and the contrast along their common border; small or textured regions are
+   nearer to all their neighbors.
+3. Proposals: the persistent regions. A region's score compares the distance at which it was merged away (death) with
+   that at which it was made (birth). Regions overlap only by containing one another; `levels` chooses among them.
 
 All lengths are shares of the image's; distances are in 8-bit CIE Lab. Nothing is tuned to a scene.
 """
@@ -26,52 +26,52 @@ from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 Labels = IntArray
 Pairs = tuple[Labels, Labels, DoubleArray]
 
-WORKING_SIDE = 480
-"""Pixels of the longer side at which regions are found; more finds texture, not things."""
-FEWEST_PIXELS = 8
-"""An image whose shorter side is less shows nothing."""
+WORKING_SIDE_PX = 480
+"""Longer side at which regions are found; a larger one finds texture, not things."""
+MIN_SIDE_PX = 8
+"""An image with a shorter side yields nothing."""
 GRAPH_SIGMA, GRAPH_K = 0.6, 15.0
-"""The graph segmentation's blur in pixels, and its k, which makes superpixels large; small here, as merging follows."""
-SMALLEST_SUPERPIXEL = 1e-4
+"""The graph segmentation's blur in pixels, and its k: small, for small superpixels, as merging follows."""
+MIN_SUPERPIXEL_SHARE = 1e-4
 """Share of the image."""
 CELL_SHARE = 1 / 40
 """Side of a SLIC cell, as a share of the image's longer side."""
-LIGHTNESS = 0.5
-"""Weight of lightness beside the two color channels: shading and shadows change lightness first."""
-TEXTURE = 0.03
+LIGHTNESS_WEIGHT = 0.5
+"""Relative to the two color channels: shading and shadows change lightness first."""
+TEXTURE_WEIGHT = 0.03
 """Color distances are divided by 1 + this times the standard deviation inside the less textured of the two regions."""
 REACH_PX = 2
-"""Contrast is taken so many pixels to either side of a border: the border itself is blurred."""
-SMALL_REGION = 4e-3
-"""Share of the image: a region of this size is nearer to its neighbors by the root of 2 than a large one."""
-NOISE = 5.0
-"""Smaller distances say nothing: it is added to both sides of the score's ratio."""
-SMALLEST_SHARE, LARGEST_SHARE = 4e-4, 0.6
-"""Shares of the image's pixels: smaller is no thing that a word names, larger is the surroundings."""
+"""Contrast is measured this far to either side of a border, which itself is blurred."""
+SMALL_REGION_SHARE = 4e-3
+"""Share of the image: a region of this size is nearer to its neighbors by a factor sqrt(2) than a large one."""
+NOISE_DISTANCE = 5.0
+"""Smaller distances are insignificant: it is added to both sides of the score's ratio."""
+MIN_REGION_SHARE, MAX_REGION_SHARE = 4e-4, 0.6
+"""Shares of the image: a smaller region is nothing that a word names, a larger one is the surroundings."""
 TYPICAL_SHARE = 6e-3
-"""Scores of regions much smaller than this share are lowered: of two that last as long, the larger is the thing."""
-LEAST_SCORE = 0.1
-ALIKE = 0.85
-"""A region that is more than this share of one above it in the tree is the same thing; the higher score stays."""
-MOST = 250
-"""At most so many proposals of an image, the best by score."""
+"""Scores of regions much smaller than this share are lowered: of two as persistent, the larger is the thing."""
+MIN_SCORE = 0.1
+SAME_REGION_SHARE = 0.85
+"""A region with more than this share of an ancestor's area is the same thing; the higher score stays."""
+MAX_PROPOSALS = 250
+"""Per image, the best by score."""
 
 
 class OpenCVProposer:
-    """The embedded proposer: OpenCV's contrib modules, no weights."""
+    """The built-in proposer: OpenCV's contrib modules, no weights."""
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB."""
         cv2 = require_cv2()
         height, width = image.shape[:2]
-        scale = min(1.0, WORKING_SIDE / max(height, width))
+        scale = min(1.0, WORKING_SIDE_PX / max(height, width))
         size = round(width * scale), round(height * scale)
-        if min(size) < FEWEST_PIXELS:
+        if min(size) < MIN_SIDE_PX:
             return Proposals(np.zeros((0, height, width), np.bool_), np.zeros(0, np.float32))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         tree = region_tree(small)
-        chosen, scores = tree.lasting()
-        # With superpixels numbered so that each region is a run of them, its mask is two comparisons a pixel.
+        chosen, scores = tree.persistent()
+        # Superpixels are numbered so that each region is a run of them: its mask is two comparisons per pixel.
         place, runs = tree.runs()
         rank = place[tree.superpixels]
         masks = np.zeros((len(chosen), height, width), np.bool_)
@@ -83,23 +83,23 @@ class OpenCVProposer:
 
 @dataclass(frozen=True)
 class RegionTree:
-    """Superpixels and what they were merged into.
+    """Superpixels and the regions that they were merged into.
 
-    superpixels: (H, W) int32, 0..n-1. parent: (m,) int32 of the n superpixels, then of merged regions in the order of
-    their making, so that a parent comes after its children; -1 a root. made, gone: (m,) the distance at which a region
-    was made (0 for superpixels) and merged away (infinite for roots). area: (m,) pixels.
+    superpixels: (H, W) int32, 0..n-1. parent: (m,) int32 of the n superpixels, then of merged regions in order of
+    birth, so that a parent comes after its children; -1 a root. birth, death: (m,) distance at which a region was made
+    (0 for superpixels) and merged away (infinite for roots). area: (m,) pixels.
     """
 
     superpixels: Labels
     parent: Labels
-    made: DoubleArray
-    gone: DoubleArray
+    birth: DoubleArray
+    death: DoubleArray
     area: DoubleArray
 
     def runs(self) -> tuple[Labels, Labels]:
-        """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
-        # Sizes from the leaves up, as parents come after their children; then places from the roots down, each region
-        # taking the next free ones of its parent.
+        """An order of superpixels in which every region is a run: (n,) the place of each, (m, 2) first and end."""
+        # Sizes from the leaves up, as parents come after their children; then places from the roots down: each region
+        # takes the next free ones of its parent.
         leaves = int(self.superpixels.max()) + 1
         size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
         for region, above in enumerate(self.parent.tolist()):
@@ -113,22 +113,22 @@ class RegionTree:
             free[above] += size[region]
         return first[:leaves], np.stack([first, first + size], axis=1)
 
-    def lasting(self) -> tuple[NDArray[np.intp], FloatArray]:
+    def persistent(self) -> tuple[NDArray[np.intp], FloatArray]:
         """Regions worth a proposal, best first, and their scores in [0, 1)."""
-        gone = np.minimum(self.gone, 1.5 * self.made.max())  # as if a root were merged away a little later
+        death = np.minimum(self.death, 1.5 * self.birth.max())  # as if a root were merged away a little later
         share = self.area / self.superpixels.size
-        score = 1 - (self.made + NOISE) / (np.maximum(gone, self.made) + NOISE)
+        score = 1 - (self.birth + NOISE_DISTANCE) / (np.maximum(death, self.birth) + NOISE_DISTANCE)
         score *= np.sqrt(share / (share + TYPICAL_SHARE))
-        kept = (share > SMALLEST_SHARE) & (share < LARGEST_SHARE) & (score > LEAST_SCORE)
+        kept = (share > MIN_REGION_SHARE) & (share < MAX_REGION_SHARE) & (score > MIN_SCORE)
         # Of a chain of regions that hardly grow, one stays.
         for region in np.flatnonzero(kept):
             above = self.parent[region]
-            while above >= 0 and ALIKE * self.area[above] < self.area[region]:
+            while above >= 0 and SAME_REGION_SHARE * self.area[above] < self.area[region]:
                 if kept[above] and kept[region]:
                     kept[region if score[region] < score[above] else above] = False
                 above = self.parent[above]
         chosen = np.flatnonzero(kept)
-        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:MOST]
+        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:MAX_PROPOSALS]
         return chosen, score[chosen].astype(np.float32)
 
 
@@ -136,15 +136,15 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
     """Superpixels of an image (H, W, 3) uint8 RGB, and all regions that they merge into, up to one for the image."""
     cv2 = require_cv2()
     lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
-    lab[:, :, 0] *= LIGHTNESS
+    lab[:, :, 0] *= LIGHTNESS_WEIGHT
     superpixels = _superpixels(lab)
     pixels = lab.reshape(-1, 3).astype(np.float64)
-    # Sums over the pixels of each region, so that a merger is an addition: how many, colors, their squares.
+    # Sums over the pixels of each region, so that merging is addition: count, colors, their squares.
     regions = _sums(superpixels.ravel(), np.column_stack([np.ones(len(pixels)), pixels, pixels**2]))
     borders = _Borders.of(superpixels, lab)
-    # number: of each current region in the tree, which has at most 2 n - 1.
+    # number: each current region's index in the tree, which has at most 2 n - 1 regions.
     count = len(regions)
-    number, made = np.arange(count), np.zeros(2 * count - 1)
+    number, birth = np.arange(count), np.zeros(2 * count - 1)
     parent, area = np.full(2 * count - 1, -1, np.int32), np.zeros(2 * count - 1)
     area[:count] = regions[:, 0]
     while len(borders.a):
@@ -153,19 +153,19 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
         a, b = borders.a[pairs], borders.b[pairs]
         new = np.arange(count, count + len(pairs))
         parent[number[a]] = parent[number[b]] = new
-        # Distances may shrink as regions grow; the height of a merger never lies below those of its two regions.
-        made[new] = np.maximum(distance[pairs], np.maximum(made[number[a]], made[number[b]]))
+        # Distances may shrink as regions grow; a merged region is never born before its two parts.
+        birth[new] = np.maximum(distance[pairs], np.maximum(birth[number[a]], birth[number[b]]))
         area[new] = regions[a, 0] + regions[b, 0]
         count += len(pairs)
-        # b goes into a; then current regions are numbered 0, 1, ... again, and their sums and borders gathered.
+        # b is merged into a; then current regions are renumbered 0, 1, ..., and their sums and borders gathered.
         number[a] = new
         into = np.arange(len(number))
         into[b] = a
         left, into = np.unique(into, return_inverse=True)
         number = number[left]
         regions, borders = _sums(into, regions), borders.gathered(into)
-    parent, made, area = parent[:count], made[:count], area[:count]
-    return RegionTree(superpixels, parent, made, np.where(parent >= 0, made[parent], np.inf), area)
+    parent, birth, area = parent[:count], birth[:count], area[:count]
+    return RegionTree(superpixels, parent, birth, np.where(parent >= 0, birth[parent], np.inf), area)
 
 
 def _superpixels(lab: FloatArray) -> Labels:
@@ -174,7 +174,7 @@ def _superpixels(lab: FloatArray) -> Labels:
     if not hasattr(cv2, "ximgproc"):
         raise MissingExtraError("opencv-contrib-python-headless (this OpenCV has no ximgproc)", "fit")
     height, width = lab.shape[:2]
-    smallest = max(4, round(SMALLEST_SUPERPIXEL * height * width))
+    smallest = max(4, round(MIN_SUPERPIXEL_SHARE * height * width))
     segments = cv2.ximgproc.segmentation.createGraphSegmentation(GRAPH_SIGMA, GRAPH_K, smallest).processImage(lab)
     side = max(4, round(CELL_SHARE * max(height, width)))
     cells = cv2.ximgproc.createSuperpixelSLIC(lab.astype(np.uint8), cv2.ximgproc.SLICO, side, 10.0)
@@ -186,7 +186,7 @@ def _superpixels(lab: FloatArray) -> Labels:
 
 @dataclass(frozen=True)
 class _Borders:
-    """Neighbors a < b, (e,), and sums over the pixel pairs of their border: how many, contrast."""
+    """Neighbors a < b, (e,), and sums over the pixel pairs of their border: count, contrast."""
 
     a: NDArray[np.integer]
     b: NDArray[np.integer]
@@ -226,22 +226,21 @@ def _pixel_pairs(labels: Labels, lab: FloatArray) -> Pairs:
 
 
 def _distances(regions: DoubleArray, borders: _Borders, pixels: int) -> DoubleArray:
-    """(e,) distance of the two regions of each border. regions: (n, 7) number of pixels, sums of colors, and of their
-    squares."""
+    """(e,) distance of the two regions of each border. regions: (n, 7) pixels, sums of colors, of their squares."""
     a, b, area = borders.a, borders.b, regions[:, 0]
     mean, mean_squared = regions[:, 1:4] / area[:, None], regions[:, 4:] / area[:, None]
     texture = np.sqrt(np.maximum(mean_squared - mean**2, 0).sum(axis=1))
-    # The mean of two differences, of all colors and of those along the border; texture and small size shrink it.
+    # The mean of two differences, of mean colors and of colors along the border; texture and small size shrink it.
     color = np.linalg.norm(mean[a] - mean[b], axis=1)
-    color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE * np.minimum(texture[a], texture[b]))
+    color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE_WEIGHT * np.minimum(texture[a], texture[b]))
     share = np.minimum(area[a], area[b]) / pixels
-    return color * np.sqrt(share / (share + SMALL_REGION))
+    return color * np.sqrt(share / (share + SMALL_REGION_SHARE))
 
 
 def _nearest_pairs(borders: _Borders, distance: DoubleArray, count: int) -> NDArray[np.intp]:
-    """Borders whose two regions are each other's nearest, and of these only the nearest third, at least one: so the
-    order of mergers stays close to that of merging the nearest pair each time."""
-    # By ranks, which have no ties.
+    """Borders whose two regions are each other's nearest; of these only the nearest third, at least one, so that the
+    order stays close to that of merging the nearest pair each time."""
+    # Ranks have no ties.
     order = np.argsort(distance, kind="stable")
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))

@@ -17,17 +17,17 @@ from og_pointcloud.formats.images import image_size, require_cv2, require_scaled
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
-CELL_WIDTH = 480
-TINT = 0.55
+CELL_WIDTH_PX = 480
+MASK_OPACITY = 0.55
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A posed image. name: its view's. path: as the pose file says. file: where it is. camera: from world coordinates.
+    """A posed image. name: its view's. path: as in the pose file. file: where it is. camera: from world coordinates.
 
     face: None where masks are made on the image as it is; they are undistorted when they are read. An image that no
-    pinhole can show is several photographs, each a face of a cube: models know pinhole images, and the border of a
-    panorama then cuts no thing in two.
+    pinhole can show becomes several photographs, each a face of a cube: models are trained on pinhole images, and the
+    border of a panorama then cuts nothing in two.
     """
 
     name: str
@@ -64,7 +64,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
 
 def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
     whole = image.camera if image.face is None else image.face.whole
-    # Here, and not when the image's turn comes: a night of work must not end in a wrong size.
+    # Checked here, not when the image's turn comes: a night of work must not end in a wrong size.
     cure = (
         "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
         "pixels as stored)"
@@ -79,7 +79,8 @@ def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], 
     """A PNG of images in a row, with their masks below. pictures: (H, W, 3) uint8 RGB and (H, W) ids of each."""
     cv2 = require_cv2()
     height, width = pictures[0][1].shape
-    size = CELL_WIDTH, max(1, round(2 * CELL_WIDTH * height / width))  # the first image's for all: mostly one camera
+    # The first image's size for all: mostly one camera.
+    size = CELL_WIDTH_PX, max(1, round(2 * CELL_WIDTH_PX * height / width))
     cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in pictures]
     sheet = np.hstack([cv2.resize(cell, size, interpolation=cv2.INTER_AREA) for cell in cells])
     write_png(path, sheet)
@@ -89,7 +90,7 @@ def _drawn(image: NDArray[np.uint8], ids: NDArray[np.int32]) -> NDArray[np.uint8
     """(H, W, 3) uint8 RGB: the image tinted by mask, with white borders. ids: (H, W), -1 outside every mask."""
     tinted = image.astype(np.float32)
     inside = ids >= 0
-    tinted[inside] = (1 - TINT) * tinted[inside] + TINT * label_colors(ids[inside])
+    tinted[inside] = (1 - MASK_OPACITY) * tinted[inside] + MASK_OPACITY * label_colors(ids[inside])
     # A pixel is border where its left or its upper neighbor has another id.
     tinted[:, 1:][ids[:, 1:] != ids[:, :-1]] = 255
     tinted[1:][ids[1:] != ids[:-1]] = 255

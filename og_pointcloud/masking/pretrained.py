@@ -1,7 +1,7 @@
-"""A folder of transformers -> its model; nothing is taken from the folder but numbers.
+"""A transformers folder -> its model; nothing but numbers is taken from the folder.
 
-Its config.json must name a type that is asked for, whose class is transformers' own: code in the folder (auto_map) is
-not looked at. Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
+Its config.json must name an accepted type, whose class is transformers' own: code in the folder (auto_map) is ignored.
+Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attenti
 
     classes: model_type -> transformers' class to take. attention: how transformers computes it; "eager" is plain matrix
     products, which exports well.
-    SceneError where the folder is of none of these types, or its weights are not whole.
+    SceneError where the folder is of none of these types, or its weights are incomplete.
     """
     kind = _model_type(folder, classes)
     try:
@@ -33,7 +33,7 @@ def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attenti
             folder, local_files_only=True, trust_remote_code=False, use_safetensors=True,
             attn_implementation=attention, dtype=torch.float32, output_loading_info=True,
         )  # fmt: skip
-    except Exception as error:  # of many types, some of safetensors' own
+    except Exception as error:  # many types, some of safetensors' own
         raise SceneError(
             f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a whole {classes[kind]} "
             "with weights in .safetensors: fetch it again, or save it again with save_pretrained"

@@ -1,8 +1,8 @@
 """SAM, SAM-HQ, SAM 2 and SAM 3 through transformers, without its image processors and without torchvision.
 
-What the processors would do is a few lines (`prepared`), with the numbers of the model's ``preprocessor_config.json``:
-SAM and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. Of SAM 3, the tracker half
-answers points; words are in ``sam3``.
+`prepared` does the processors' work in a few lines, with the numbers of the model's ``preprocessor_config.json``: SAM
+and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. SAM 3's tracker half takes points;
+words are in ``sam3``.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ CLASSES = {
     "sam3_tracker": "Sam3TrackerModel",
     "sam3_tracker_video": "Sam3TrackerModel",
 }
-"""config.json's model_type -> the class that answers points."""
-PADDED = ("sam", "sam_hq")
-IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+"""config.json's model_type -> the class that takes point prompts."""
+PADDED_MODELS = ("sam", "sam_hq")
+IMAGENET_MEAN_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+HALF_MEAN_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,12 @@ class SamPredictor:
         preparation, device = self.loaded.preparation, self.loaded.device
         height, width = scaled_size(self.size, preparation)
         scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
-        # Prompts count the pixels of the model's square, in which the image was scaled.
-        asked = torch.from_numpy(points * scale)[None, :, None].to(device)  # (images, prompts, points each, xy)
-        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=device)  # 1: on the thing
-        answer = self.loaded.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)
+        # Prompts are in pixels of the model's square, to which the image was scaled.
+        prompts = torch.from_numpy(points * scale)[None, :, None].to(device)  # (images, prompts, points each, xy)
+        labels = torch.ones(prompts.shape[:3], dtype=torch.int32, device=device)  # 1: on the thing
+        answer = self.loaded.model(input_points=prompts, input_labels=labels, multimask_output=True, **self.encoded)
         logits = answer.pred_masks[0].float()
-        # Without what was padded.
+        # Without the padding.
         rows = max(1, round(logits.shape[-2] * height / preparation.side))
         columns = max(1, round(logits.shape[-1] * width / preparation.side))
         return logits[..., :rows, :columns].cpu().numpy(), answer.iou_scores[0].float().cpu().numpy()
@@ -137,12 +137,12 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 
 
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
-    """Side from the model's configuration, colors from the preprocessor's file where the folder has one, else those
-    that the published models were trained with."""
-    sized = config.vision_config if kind in PADDED else getattr(config, "prompt_encoder_config", config)
+    """Side from the model's configuration; mean and std from the preprocessor's file if there is one, else those of the
+    published models' training."""
+    sized = config.vision_config if kind in PADDED_MODELS else getattr(config, "prompt_encoder_config", config)
     side = sized.image_size[0] if isinstance(sized.image_size, (list, tuple)) else sized.image_size
     stated = read_config(folder, "preprocessor_config.json", "processor_config.json")
     stated = stated.get("image_processor", stated)
-    mean, std = HALVES if kind.startswith("sam3") else IMAGENET
+    mean, std = HALF_MEAN_STD if kind.startswith("sam3") else IMAGENET_MEAN_STD
     mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
-    return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
+    return Preparation(int(side), kind in PADDED_MODELS, tuple(map(float, mean)), tuple(map(float, std)))

@@ -1,8 +1,8 @@
-"""SAM 3's words through transformers: a mask for each thing that a word names, in one image or followed through many.
+"""SAM 3 with word prompts, through transformers: a mask for each thing that a word names, in one image or tracked.
 
 Words go through the model's own tokenizer.json, read like all others (`text.tokenizer`), and are not padded, as the
-model masks padding anyway. While it tracks, transformers would fetch code from elsewhere; it is kept from that. Without
-that code overlapping tracks are not thinned out, but settling the masks of an image does it.
+model masks padding anyway. For tracking, transformers would fetch code from elsewhere, which is prevented here. Without
+that code overlapping tracks are not suppressed, but `levels` resolves the overlaps of an image's masks.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from og_pointcloud.masking.pretrained import torch, transformers
 from og_pointcloud.masking.sam import LoadedModel, load_sam
 from og_pointcloud.text.tokenizer import open_tokenizer
 
-LEAST_SCORE = 0.5
+MIN_SCORE = 0.5
 """Detections need this score, as in transformers' examples. A tracker takes it from its configuration."""
-TRACKS_OF_A_RUN = 1 << 32
-"""Tracks of a run are numbered from images_before times this on, so that no two runs share a number."""
+TRACK_IDS_PER_IMAGE = 1 << 32
+"""A run's tracks are numbered from images_before times this on, so that no two runs share a number."""
 
 
 class NamedThings:
-    """A proposer of what words name in an image by itself."""
+    """A proposer of what words name in a single image."""
 
     def __init__(self, name: StrPath, words: Sequence[str]) -> None:
         """name: as for `sam.SamPredictor`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
@@ -42,23 +42,23 @@ class NamedThings:
         seen = model.get_vision_features(pixel_values=self._loaded.pixels(image))
         for tokens in self._tokens:
             answer = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
-            # A query's score is how likely it is such a thing, times how likely the image shows any.
+            # A query's score: the probability that it is such a thing, times that of the image showing any.
             score = (answer.pred_logits.sigmoid() * answer.presence_logits.sigmoid())[0]
-            kept = score > LEAST_SCORE
+            kept = score > MIN_SCORE
             masks.append(answer.pred_masks[0, kept].sigmoid() - 0.5)
             scores.append(score[kept])
         return _proposals(torch.cat(masks), torch.cat(scores), image)
 
 
 class FollowedWords:
-    """A proposer of what words name in images that come one after the other, which keeps the tracks of things."""
+    """A proposer of what words name in consecutive images, with the tracks of things."""
 
     def __init__(self, name: StrPath, words: Sequence[str], images_before: int = 0) -> None:
         """As `NamedThings`, with a SAM 3 that has its tracker. images_before: how many images earlier runs have done,
-        so that tracks of this run have other numbers than theirs."""
+        so that this run's tracks get other numbers than theirs."""
         self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})
-        self._first = images_before * TRACKS_OF_A_RUN
-        # The value that transformers sets when fetching has failed: else it would fetch code and run it.
+        self._first = images_before * TRACK_IDS_PER_IMAGE
+        # The value that transformers sets where fetching fails; without it, code would be fetched and run.
         sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
         device, self._step = self._loaded.device, 0
         self._session: Any = transformers.Sam3VideoInferenceSession(
@@ -76,7 +76,7 @@ class FollowedWords:
         seen = self._loaded.model(inference_session=self._session, frame=pixels, frame_idx=self._step)
         self._forget()
         self._step += 1
-        # Tracks that the tracker itself holds back in this image, or has given up.
+        # Tracks that the tracker itself suppresses in this image, or has removed.
         hidden = {*(seen.suppressed_obj_ids or ()), *(seen.removed_obj_ids or ())}
         tracks = [track for track in sorted(seen.obj_id_to_mask) if track not in hidden]
         masks = [torch.zeros((0, 1, 1)), *(seen.obj_id_to_mask[track].float().cpu() for track in tracks)]
@@ -84,7 +84,7 @@ class FollowedWords:
         return _proposals(torch.cat(masks[1:] or masks), scores, image, self._first + np.array(tracks, np.int64))
 
     def _forget(self) -> None:
-        """Let go of what lies farther back than the tracker looks: an image takes 12 MB, each thing in it one more."""
+        """Free what lies farther back than the tracker looks: an image takes 12 MB, and each thing in it 1 MB more."""
         tracker = self._loaded.model.config.tracker_config
         oldest = self._step - max(tracker.max_object_pointers_in_encoder, tracker.num_maskmem)
         self._session.processed_frames.pop(self._step)
@@ -108,7 +108,7 @@ def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
 def _proposals(
     values: torch.Tensor, scores: torch.Tensor, image: NDArray[np.uint8], tracks: NDArray[np.int64] | None = None
 ) -> Proposals:
-    """Masks of values (n, h, w) above 0, at the image's size; those without a pixel are left out."""
+    """Masks where values (n, h, w) are above 0, at the image's size; those without a pixel are left out."""
     size = image.shape[:2]
     if not len(values):
         return Proposals(np.zeros((0, *size), np.bool_), np.zeros(0, np.float32), tracks)

@@ -1,6 +1,6 @@
-"""The work on one image, from proposals to an id map and features in a work file that is whole or absent; and on many.
+"""From an image to an id map and features in a work file that is whole or absent; for one image and for many.
 
-Models are opened once. A broken image stops no other; a run that is killed loses only the images in work.
+Models are opened once. A broken image does not stop the others; a killed run loses only the images in progress.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.masking.contracts import MaskProposer, MaskSettings
 from og_pointcloud.masking.encode import open_encoder
-from og_pointcloud.masking.existing import ExistingMasks, own_proposer
-from og_pointcloud.masking.levels import settled
+from og_pointcloud.masking.existing import ExistingMasks, user_proposer
+from og_pointcloud.masking.levels import masks_of_level
 from og_pointcloud.masking.photographs import Photograph
 
 
@@ -35,7 +35,7 @@ class ImageWorker:
     """The models of a run."""
 
     def __init__(self, settings: MaskSettings, done: int = 0) -> None:
-        """done: images that earlier runs have done; tracks do not go on from these."""
+        """done: images that earlier runs have done; tracks do not continue from these."""
         self.settings = settings
         if settings.folder and not settings.words:
             self.proposer = ExistingMasks(settings.folder, settings.tracks)
@@ -44,7 +44,7 @@ class ImageWorker:
         self.encoder = open_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
 
     def __call__(self, task: ImageTask) -> str | None:
-        """Make the image's work file; returns what is wrong with the image, or None."""
+        """Make the image's work file; returns the image's error, or None."""
         try:
             image = task.photograph.read(self.settings.longest_side)
             with replacing(task.work_file) as file:
@@ -54,22 +54,21 @@ class ImageWorker:
         return None
 
     def _masks(self, image: NDArray[np.uint8], name: str) -> dict[str, Any]:
-        """The arrays of a work file: the id map of the level that is asked for, and features and tracks of its
-        masks."""
+        """The arrays of a work file: the id map at the chosen level, and features and tracks of its masks."""
         proposer = self.proposer
         existing = isinstance(proposer, ExistingMasks)
         proposals = proposer.of(name, image.shape[:2]) if existing else proposer.propose(image)
-        ids, chosen = settled(proposals, self.settings.level)
+        ids, chosen = masks_of_level(proposals, self.settings.level)
         masks = ids == np.arange(ids.max(initial=-1) + 1)[:, None, None]
         space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
         features = self.encoder.embed(image, masks) if self.encoder else np.zeros((len(masks), 1))
-        # The numbers of unit vectors lose at most 0.05 % in 16 bits.
+        # Components of unit vectors lose at most 0.05 % in 16 bits.
         made = {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
         return made if proposals.tracks is None else {**made, "tracks": proposals.tracks[chosen]}
 
 
 def read_work(file: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a work file. SceneError where the disk fails: such files are complete."""
+    """The arrays of a work file. SceneError where it cannot be read: a disk error, as work files are complete."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
@@ -77,27 +76,27 @@ def read_work(file: Path) -> dict[str, NDArray[Any]]:
         raise SceneError(f"{file} cannot be read ({error}): remove it, and the same command makes it again") from None
 
 
-def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = None) -> MaskProposer:
-    """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``python:MODULE:NAME``, a function or proposer of the user's
-    own (`existing.own_proposer`).
+def open_proposer(text: str, words: Sequence[str] = (), images_before: int | None = None) -> MaskProposer:
+    """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``python:MODULE:NAME``, a user's function or proposer
+    (`existing.user_proposer`).
 
-    words: what SAM 3 looks for; left out, everything. followed: with words, follow them from image to image, as the
-    run that begins after so many images (`sam3.FollowedWords`).
-    Nothing is downloaded. SceneError names what is known. A folder of masks is no proposer of this kind: it goes by
-    the image's name (`existing.ExistingMasks`).
+    words: what SAM 3 looks for; left out, everything. images_before: with words, track them from image to image, in a
+    run that begins after this many images (`sam3.FollowedWords`).
+    Nothing is downloaded. SceneError lists what is known. A folder of masks is not opened here: its masks are found by
+    image name (`existing.ExistingMasks`).
     """
     kind, _, name = text.partition(":")
-    if words or followed is not None:
+    if words or images_before is not None:
         if kind != "sam" or not name or not words:
-            asked = "tracks" if followed is not None else "words"
+            needs = "tracks" if images_before is not None else "words"
             raise SceneError(
-                f"{asked} are asked of proposer '{text}'{'' if words else ' without words'}; expected words with SAM 3 "
+                f"{needs} are asked of proposer '{text}'{'' if words else ' without words'}; expected words with SAM 3 "
                 "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both, or with a folder of id PNGs"
             )
-        # Imported where it is asked for, as all proposers below: torch takes seconds, and not everybody has it.
+        # Imported on demand, like all proposers below: torch takes seconds, and not everybody has it.
         from og_pointcloud.masking.sam3 import FollowedWords, NamedThings
 
-        return NamedThings(name, words) if followed is None else FollowedWords(name, words, followed)
+        return NamedThings(name, words) if images_before is None else FollowedWords(name, words, images_before)
     if text == "opencv":
         from og_pointcloud.masking.opencv import OpenCVProposer
 
@@ -108,7 +107,7 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
 
         return AutomaticMasks(SamPredictor(name))
     if kind == "python" and name:
-        return own_proposer(name)
+        return user_proposer(name)
     raise SceneError(
         f"proposer is '{text}'; expected opencv, sam:FOLDER, sam:OWNER/MODEL, python:MODULE:NAME, or a folder of id "
         "PNGs or COCO JSON files"
@@ -116,8 +115,8 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
 
 
 def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
-    """What is wrong with each task's image, None for nothing, in the order of the tasks. Without tasks no model is
+    """Each task's error, or None, in the order of the tasks. Without tasks no model is
     opened. done: images that earlier runs have done."""
     if tasks:
-        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it waits for the images in work
+        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it waits for the images in progress
             yield from pool.map(ImageWorker(settings, done), tasks)

@@ -1,1 +1,1 @@
-"""Points -> what each view shows of them: Gaussians of a plain cloud, blending weights."""
+"""Points -> what each view shows of them: Gaussians for a plain cloud, blending weights."""

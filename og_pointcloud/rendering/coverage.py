@@ -1,10 +1,10 @@
-"""Which views a fit needs: where views enough see the same points, further ones say little and cost as much.
+"""Which views a fit needs: where enough views see the same points, further ones add little and cost as much.
 
-A wide lens shows the whole room from each place, a video shows it again with every frame. Of a sample of the points it
-is asked which ones each view sees: those in its image that do not lie behind others. Then views are left out one after
-the other, as long as nearly all that each of them sees is seen by enough of the views that stay, and most of what each
-of its masks shows is in masks, of whatever, of as many: what few views have any mask of loses none of these. Not asked
-about are masks without a point of the sample, and which thing the others' masks show.
+A wide lens shows the whole room from each place, a video shows it again with every frame. For a sample of the points,
+each view's visible ones are found: those in its image that do not lie behind others. Then views are dropped one after
+the other, as long as enough of the remaining views see nearly all points that the dropped view sees, and as many of
+them have masks (of anything) on most points of each of its masks. So what only few views have masks of keeps them all.
+Masks without a sampled point are ignored, and so is what the other views' masks show.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.geometry import sample_of_points
-from og_pointcloud.rendering.splatting import seen_from
+from og_pointcloud.rendering.splatting import depth_and_slopes
 from og_pointcloud.scene import Camera, Scene, View
 
-SAMPLE = 8000
-"""Points that stand for all."""
-FEW = 0.05
-"""Share of what a view sees that may be seen by fewer others: there is nearly always something at its border."""
-CELL_POINTS = 4
-"""Points in a cell of a view's image, on average: of so few, one lies on the surface in front."""
-BEHIND = 1.3
+SAMPLE_POINTS = 8000
+"""Points that stand for the whole cloud."""
+MAX_RARE_SHARE = 0.05
+"""Share of a view's points that too few other views may see: there are nearly always some at its border."""
+POINTS_PER_CELL = 4
+"""Mean number of points in a cell of a view's image: even of so few, one lies on the front surface."""
+DEPTH_RATIO = 1.3
 """A point deeper than this times the nearest of its cell is hidden: a slanted surface goes nearly as deep in a cell."""
 
 
 def with_needed_views(scene: Scene, enough: int, journal: Journal) -> Scene:
-    """The scene without views that it does not need; which ones, their names decide, not their order."""
+    """The scene without the views that it does not need; the choice depends on their names, not on their order."""
     order = np.argsort([zlib.crc32(view.name.encode()) for view in scene.views])
-    xyz = scene.points.xyz[sample_of_points(scene.points.xyz, SAMPLE)]
+    xyz = scene.points.xyz[sample_of_points(scene.points.xyz, SAMPLE_POINTS)]
     seen = seen_points(xyz, [view.camera for view in scene.views])
     # Masks are read only where the cameras alone leave a choice.
     if needed_views(seen, np.full(seen.shape, -1, np.int32), order, enough).all():
@@ -52,13 +52,13 @@ def needed_views(
     seen: NDArray[np.bool_], mask: NDArray[np.int32], order: NDArray[np.integer], enough: int
 ) -> NDArray[np.bool_]:
     """(views,) bool, False for views that may be left out together. seen: (views, points). mask: (views, points) int32,
-    the mask that each point is seen in, -1 none. order: in which views are asked whether they may."""
+    the mask that each point is seen in, -1 none. order: in which views are tried."""
     needed, count, masked = np.ones(len(seen), np.bool_), seen.sum(axis=0), (mask >= 0).sum(axis=0)
     for view in order:
         points = np.flatnonzero(seen[view])
         inside = points[mask[view, points] >= 0]
         rare = np.bincount(mask[view, inside], np.where(masked[inside] <= enough, 1, -1))
-        if np.count_nonzero(count[points] <= enough) < FEW * len(points) and (rare <= 0).all():
+        if np.count_nonzero(count[points] <= enough) < MAX_RARE_SHARE * len(points) and (rare <= 0).all():
             needed[view] = False
             count[points] -= 1
             masked[inside] -= 1
@@ -66,23 +66,23 @@ def needed_views(
 
 
 def masks_at(xyz: NDArray[np.float32], seen: NDArray[np.bool_], views: Sequence[View]) -> NDArray[np.int32]:
-    """(views, n) int32, the mask that each point (n, 3) is seen in, -1 where it is in none or not seen."""
+    """(views, n) int32: the mask that each view sees each point (n, 3) in, -1 where it is in none or hidden."""
     found = np.full(seen.shape, -1, np.int32)
 
-    def look(row: int) -> None:
+    def look_up(row: int) -> None:
         points = np.flatnonzero(seen[row])
         masks, (uv_px, _) = views[row].mask_map(), views[row].camera.project(xyz[points])
         column, line = np.clip(uv_px.astype(np.intp), 0, np.array(masks.shape[::-1]) - 1).T
         found[row, points] = np.maximum(masks[line, column], -1)
 
     with ThreadPoolExecutor(get_num_threads()) as pool:
-        list(pool.map(look, np.flatnonzero(seen.any(axis=1))))
+        list(pool.map(look_up, np.flatnonzero(seen.any(axis=1))))
     return found
 
 
 def seen_points(xyz: NDArray[np.float32], cameras: Sequence[Camera]) -> NDArray[np.bool_]:
-    """(cameras, n) bool: the points (n, 3) in each image that are not hidden. Each is asked in its cell of the image,
-    where the nearest point hides what lies far behind it."""
+    """(cameras, n) bool: the points (n, 3) in each image that are not hidden. In each cell of the image, the nearest
+    point hides those that lie far behind it."""
     seen = np.zeros((len(cameras), len(xyz)), np.bool_)
     poses = np.stack([camera.world_to_camera for camera in cameras])
     numbers = np.array([(*camera.intrinsics, camera.width, camera.height) for camera in cameras])
@@ -96,16 +96,16 @@ def _mark_seen(xyz, poses, numbers, seen):  # noqa: ANN001, ANN202
         fx, fy, cx, cy, width, height = numbers[view]
         inside, place, count = np.empty(len(xyz), np.int32), np.empty((len(xyz), 3)), 0  # column, row, depth
         for g in range(len(xyz)):
-            depth, across, down = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], poses[view])
+            depth, across, down = depth_and_slopes(xyz[g, 0], xyz[g, 1], xyz[g, 2], poses[view])
             column, row = fx * across + cx, fy * down + cy
             if depth > 0 and 0 <= column < width and 0 <= row < height:
                 inside[count] = g
                 place[count] = column, row, depth
                 count += 1
-        side = np.sqrt(width * height * CELL_POINTS / max(count, 1))
+        side = np.sqrt(width * height * POINTS_PER_CELL / max(count, 1))
         front = np.full((int(height / side) + 1, int(width / side) + 1), np.inf)
         for k in range(count):
             cell = int(place[k, 1] / side), int(place[k, 0] / side)
             front[cell] = min(front[cell], place[k, 2])
         for k in range(count):
-            seen[view, inside[k]] = place[k, 2] <= BEHIND * front[int(place[k, 1] / side), int(place[k, 0] / side)]
+            seen[view, inside[k]] = place[k, 2] <= DEPTH_RATIO * front[int(place[k, 1] / side), int(place[k, 0] / side)]

@@ -1,8 +1,8 @@
-"""Sixteen float32 numbers as one value in compiled code: a row of a tile's pixels goes through the processor at once.
+"""SIMD vectors of 16 float32 for numba: a row of a tile's pixels goes through the processor at once.
 
-Numba leaves it to LLVM to find loops that can be done in vectors, and LLVM finds none in a loop with branches, stores
-and a recurrence. Here a vector is a type (``Lanes``) with operators, so that nothing has to be found. The operations
-are those of IEEE 754 in a fixed order: every processor gives the same bits, whatever the width of its registers.
+Numba leaves vectorization to LLVM, which does not vectorize a loop with branches, stores and a recurrence. Here a
+vector is a type (``Lanes``) with operators, so that nothing has to be detected. The operations are those of IEEE 754 in
+a fixed order: every processor gives the same bits, whatever the width of its registers.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numba import extending
 from numba.core import types
 from numba.extending import models, overload, register_model
 
-# Functions made by it are called without their first parameter, the context, which type checkers cannot know: Any.
+# Decorated functions are called without their first parameter, the context, which type checkers cannot know: Any.
 intrinsic: Any = extending.intrinsic
 
 WIDTH = 16
-"""Numbers in one value."""
+"""Numbers in one vector."""
 
 FLOAT, INT, BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
 FLOATS, INTS, BOOLS = (ir.VectorType(kind, WIDTH) for kind in (FLOAT, INT, BOOL))
@@ -37,7 +37,7 @@ class Lanes(types.Type):
 
 
 class Truths(types.Type):
-    """The numba type of WIDTH truth values, what comparing Lanes gives."""
+    """The numba type of WIDTH booleans, the result of comparing Lanes."""
 
     def __init__(self) -> None:
         super().__init__("Truths")
@@ -47,7 +47,7 @@ LANES, TRUTHS = Lanes(), Truths()
 
 
 def _register(kind: type[types.Type], vector: ir.VectorType) -> None:
-    """Tell numba that values of a type are LLVM vectors, held in registers."""
+    """Tell numba that values of this type are LLVM vectors, held in registers."""
 
     class Model(models.PrimitiveModel):
         def __init__(self, manager: Any, of: Any) -> None:
@@ -63,7 +63,7 @@ _register(Truths, BOOLS)
 def _operator(
     symbol: Callable[..., Any], operands: types.Type, result: types.Type, instruction: str, *how: str
 ) -> None:
-    """Give two values of a type an operator, made of one instruction."""
+    """Define an operator on two values of a type by one LLVM instruction."""
 
     @intrinsic
     def apply(context: Any, left: Any, right: Any) -> Any:
@@ -76,7 +76,7 @@ def _operator(
     def of(left, right):  # noqa: ANN001, ANN202
         if left is operands and right is operands:
             return lambda left, right: apply(left, right)
-        return None  # of other types: numba's own operator
+        return None  # other types: numba's own operator
 
 
 _operator(operator.add, LANES, LANES, "fadd")
@@ -100,7 +100,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 
 @intrinsic
-def spread(context: Any, number: Any) -> Any:
+def broadcast(context: Any, number: Any) -> Any:
     """Lanes that all hold one float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -113,7 +113,7 @@ def spread(context: Any, number: Any) -> Any:
 
 
 @intrinsic
-def ramp(context: Any) -> Any:
+def iota(context: Any) -> Any:
     """Lanes 0, 1, 2, ..."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -146,7 +146,7 @@ def store(context: Any, array: Any, index: Any, lanes: Any) -> Any:
 
 
 @intrinsic
-def either(context: Any, condition: Any, yes: Any, no: Any) -> Any:
+def select(context: Any, condition: Any, yes: Any, no: Any) -> Any:
     """Each lane from ``yes`` where the condition holds, else from ``no``."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -156,8 +156,8 @@ def either(context: Any, condition: Any, yes: Any, no: Any) -> Any:
 
 
 @intrinsic
-def lesser(context: Any, left: Any, right: Any) -> Any:
-    """The lesser of two values in each lane; ``right`` where one is NaN."""
+def minimum(context: Any, left: Any, right: Any) -> Any:
+    """The minimum of two values in each lane; ``right`` where one is NaN."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", *arguments), *arguments)
@@ -197,7 +197,7 @@ def exp2(context: Any, lanes: Any) -> Any:
 
 
 @intrinsic
-def total(context: Any, lanes: Any) -> Any:
+def lane_sum(context: Any, lanes: Any) -> Any:
     """The sum of all lanes, float32: halves are added until one number is left."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

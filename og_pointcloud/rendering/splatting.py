@@ -6,12 +6,12 @@ those weights up over the pixels of each mask, tile by tile while compositing; `
 
     A[i, g] = sum over pixels p of mask i of W[p, g]
 
-It knows nothing of colors or features: what a view shows of any value is a product with these sparse rows. A map
-that gives every pixel its own id makes ``A`` the weights ``W`` themselves.
+It knows nothing of colors or features: a view of any value is a product with these sparse rows. With an id map that
+gives every pixel its own id, ``A`` is ``W`` itself.
 
 Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces
-are, exposure counts little what shows *through* one: a splat farther than that behind the one at which a pixel became
-more covered than not. It is a depth test with the accuracy of a surface, not of a point, and takes no second pass.
+are, exposure counts little of what shows *through* one: splats farther than that behind the splat at which a pixel
+became more than half covered. It is a depth test with the accuracy of a surface, and takes no second pass.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
+from og_pointcloud.rendering.lanes import WIDTH, any_of, broadcast, exp2, iota, lane_sum, load, minimum, select, store
 from og_pointcloud.scene import Camera, Points
 
 TILE = WIDTH
 """Pixels along a tile's side: 16 as in 3DGS, so that a row of a tile is one vector."""
-RUN = 64
-"""Gaussians, one after the other, that are passed over together where they all lie beside an image."""
+GAUSSIANS_PER_BOX = 64
+"""Consecutive Gaussians that share a bounding box and are culled together."""
 BATCH = 128
-"""Splats of a tile that are fetched at once."""
+"""Splats of a tile that are fetched together."""
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 LOW_PASS = 0.3
 """Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
 ALPHA_MIN = 1.0 / 255.0
-"""Contributions below are dropped (3DGS)."""
+"""Contributions below this alpha are dropped (3DGS)."""
 LOG2_E = np.log2(np.e)
 ALPHA_MAX = 0.99
-"""Alpha is cut here (3DGS)."""
+"""Alpha is clamped to this (3DGS)."""
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel stops before the splat that would bring its transmittance below (3DGS)."""
+"""A pixel stops before the splat that would bring its transmittance below this (3DGS)."""
 FRUSTUM_MARGIN = 0.3
 """Centers beyond the image by more than this share of the half field of view are clamped when the projection is
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
@@ -53,8 +53,8 @@ NEAR_SHARE = 0.02
 
 
 class Cutoffs(NamedTuple):
-    """What blending leaves out, 3DGS's figures. Larger ones are faster and lose weight: an alpha below ``alpha_min``
-    is dropped, a pixel stops before the splat that would bring its transmittance below ``transmittance_min``."""
+    """What blending leaves out, by default as in 3DGS. Larger values are faster and lose weight: alphas below
+    ``alpha_min`` are dropped, and a pixel stops before its transmittance would fall below ``transmittance_min``."""
 
     alpha_min: float = ALPHA_MIN
     transmittance_min: float = TRANSMITTANCE_MIN
@@ -76,7 +76,7 @@ class Gaussians:
 
     @classmethod
     def from_points(cls, points: Points) -> Gaussians:
-        """The Gaussians of a 3DGS file; SceneError for a plain cloud, whose splats `geometry` has to choose."""
+        """The Gaussians of a 3DGS file; SceneError for a plain cloud, whose splats `geometry` chooses."""
         if points.scale is None or points.rotation is None or points.opacity is None:
             raise SceneError("the cloud has no scale, rotation and opacity; og.fit chooses them for a plain cloud")
         return cls(points.xyz, points.scale, points.rotation, points.opacity)
@@ -86,7 +86,7 @@ class Gaussians:
 
     @cached_property
     def boxes(self) -> NDArray[np.float32]:
-        """(runs, 7) about each RUN of them: least x, y, z, greatest x, y, z of the centers, and the longest axis."""
+        """(boxes, 7) of GAUSSIANS_PER_BOX each: least x, y, z and greatest x, y, z of the centers, and longest axis."""
         return _boxes(self.xyz, self.scale)
 
     def take(self, rows: NDArray[np.integer] | None) -> Gaussians:
@@ -100,7 +100,7 @@ def render(
     gaussians: Gaussians, values: NDArray[np.float32], camera: Camera, near: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Values (n, c) of the Gaussians as one view shows them: (H, W, c) float32, and (H, W) float32, how much of each
-    pixel is covered. Uncovered pixels are 0: this is ``W @ values`` without ``W`` in between."""
+    pixel is covered. Uncovered pixels are 0: this is ``W @ values`` without storing ``W``."""
     pixels = camera.width * camera.height
     ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
     (rows, cols, weights, first, counts), _ = _entries(gaussians, camera, ids, pixels, near, None)
@@ -123,7 +123,7 @@ def _paint(rows, cols, weights, first, counts, values, pixels):  # noqa: ANN001,
 @dataclass(frozen=True)
 class ViewWeights:
     """What one view shows. rows: (id_count + 1, n) sparse float32 without duplicates, the last row what shows in pixels
-    with id -1; they sum to at most the id's area in pixels. area: (n,) float64, the pixels each splat would weigh with
+    with id -1; they sum to at most the id's area in pixels. area: (n,) float64, each splat's weight in pixels with
     nothing in front of it, 0 where it is outside the image. through: (1, n) sparse float32, the part of a splat's
     weight that shows through a surface."""
 
@@ -170,7 +170,7 @@ def _entries(
     thickness: NDArray[np.float32] | None,
     cutoffs: Cutoffs = CUTOFFS,
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
-    """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
+    """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), where tile t has the entries
     first[t] : first[t] + counts[t]; and the area of each splat."""
     area = np.zeros(len(gaussians))
     binned = binned_splats(gaussians, camera, near, thickness, cutoffs, area)
@@ -189,16 +189,18 @@ def binned_splats(
     cutoffs: Cutoffs,
     area: NDArray[np.float64] | None = None,
 ) -> Binned:
-    """The splats of an image by tile. area: (n,), where those of Gaussians with a splat are written; None: nowhere."""
+    """The splats of an image by tile. area: (n,), to be filled in for Gaussians with a splat; None: not computed."""
     n, area = len(gaussians), np.empty(0) if area is None else area
     thickness = np.full(n, np.inf, np.float32) if thickness is None else thickness
     shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
-    rows = np.flatnonzero(_may_show(gaussians.xyz, gaussians.scale, gaussians.boxes, _borders(seen_by, cutoffs)))
+    rows = np.flatnonzero(
+        _in_frustum(gaussians.xyz, gaussians.scale, gaussians.boxes, _frustum_planes(seen_by, cutoffs))
+    )
     splats = _records(len(rows))
     order = ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
-    # In order of depth in memory too: those of a tile are then read from front to back.
+    # In order of depth in memory too: a tile's splats are then read from front to back.
     splats = _in_order(splats, order, _records(len(order)))
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
@@ -207,19 +209,19 @@ def binned_splats(
 
 
 def _records(count: int) -> NDArray[Any]:
-    """Splats with undefined values, each within one line of a processor's cache."""
+    """Splats with undefined values, each within one cache line."""
     room = np.empty((count + 1) * SPLAT.itemsize, np.uint8)
     ahead = -room.ctypes.data % SPLAT.itemsize
     return room[ahead : ahead + count * SPLAT.itemsize].view(SPLAT)
 
 
 CULLED = np.uint32(0xFFFFFFFF)
-"""A key of what has no place in an order: above those of all depths."""
+"""The key of a splat that is not drawn: above those of all depths."""
 SPLAT = np.dtype(
     [
         ("u", np.float64),  # center, px
         ("v", np.float64),
-        ("shear", np.float64),  # px that the middle of a row moves to the left for each row down
+        ("shear", np.float64),  # px that a row's middle moves to the left per row down
         ("across", np.float32),  # log2 of the density along a row is -(across * distance to the row's middle)^2
         ("down", np.float32),  # log2 of the density at the rows' middles is -down * (distance to the center's row)^2
         ("peak", np.float32),  # log2 of the opacity
@@ -233,20 +235,20 @@ SPLAT = np.dtype(
     ],
     align=True,
 )
-"""A projected Gaussian, in one line of a processor's cache. Split into rows, a quadratic form has no differences of
-large numbers: float32 holds it for any needle."""
+"""A projected Gaussian, in one cache line. Split into rows, a quadratic form has no differences of large numbers:
+float32 suffices for any needle."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def seen_from(x, y, z, pose):  # noqa: ANN001, ANN201
-    """Depth, and the two slopes of the ray to a point."""
+def depth_and_slopes(x, y, z, pose):  # noqa: ANN001, ANN201
+    """Depth of a point, and the slopes x / z and y / z of the ray to it."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     across = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
     return depth, across, (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
+def clamped_slopes(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
     """The slopes at which the projection is linearised: those of the ray, at most FRUSTUM_MARGIN outside the image."""
     fx, fy, cx, cy = intrinsics
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * size[0] / fx, FRUSTUM_MARGIN * 0.5 * size[1] / fy
@@ -258,10 +260,10 @@ def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _boxes(xyz, scale):  # noqa: ANN001, ANN202
-    boxes = np.empty((-(-len(xyz) // RUN), 7), np.float32)
+    boxes = np.empty((-(-len(xyz) // GAUSSIANS_PER_BOX), 7), np.float32)
     for run in range(len(boxes)):
         boxes[run, :3], boxes[run, 3:6], boxes[run, 6] = np.inf, -np.inf, 0
-        for g in range(run * RUN, min((run + 1) * RUN, len(xyz))):
+        for g in range(run * GAUSSIANS_PER_BOX, min((run + 1) * GAUSSIANS_PER_BOX, len(xyz))):
             for axis in range(3):
                 boxes[run, axis] = min(boxes[run, axis], xyz[g, axis])
                 boxes[run, 3 + axis] = max(boxes[run, 3 + axis], xyz[g, axis])
@@ -270,12 +272,12 @@ def _boxes(xyz, scale):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _borders(seen_by, cutoffs):  # noqa: ANN001, ANN202
+def _frustum_planes(seen_by, cutoffs):  # noqa: ANN001, ANN202
     """(5, 5): the near plane and the four borders of an image. Where ``a x + b y + c z + d + e * longest axis`` of a
-    row (a, b, c, d, e) is not above 0, a circle around the splat's ellipse, larger than it, lies beyond."""
+    row (a, b, c, d, e) is not above 0, a circle that encloses the splat's ellipse lies beyond it."""
     pose, (fx, fy, cx, cy), size, near = seen_by
-    low_x, low_y = linearised_at(-np.inf, -np.inf, (fx, fy, cx, cy), size)
-    high_x, high_y = linearised_at(np.inf, np.inf, (fx, fy, cx, cy), size)
+    low_x, low_y = clamped_slopes(-np.inf, -np.inf, (fx, fy, cx, cy), size)
+    high_x, high_y = clamped_slopes(np.inf, np.inf, (fx, fy, cx, cy), size)
     # Standard deviations from the center to where an opaque splat's alpha is the least; a tenth more for poses and
     # quaternions that are not quite of length one. Times depth, the radius is own * longest axis + blur * depth.
     reach = 1.1 * np.sqrt(-2 * np.log(cutoffs.alpha_min))
@@ -284,7 +286,7 @@ def _borders(seen_by, cutoffs):  # noqa: ANN001, ANN202
     blur = reach * np.sqrt(LOW_PASS) + 1
     borders = np.zeros((5, 5))
     borders[0, :4] = pose[2]
-    borders[0, 3] -= 0.999999 * near  # for rounding: which depths are beyond it `_project` says
+    borders[0, 3] -= 0.999999 * near  # a margin for rounding: `_project` decides exactly
     borders[1, :4], borders[1, 4] = fx * pose[0] + (cx + blur) * pose[2], own_x
     borders[2, :4], borders[2, 4] = -fx * pose[0] + (size[0] - cx + blur) * pose[2], own_x
     borders[3, :4], borders[3, 4] = fy * pose[1] + (cy + blur) * pose[2], own_y
@@ -293,8 +295,8 @@ def _borders(seen_by, cutoffs):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _may_show(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
-    """(n,) bool: not of splats that lie beyond one of an image's borders: most of a cloud costs a product a run and a
+def _in_frustum(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
+    """(n,) bool: False for splats beyond one of an image's borders. Most of a cloud then costs one product per box and
     border, and no projection."""
     may = np.zeros(len(xyz), np.bool_)
     for run in prange(len(boxes)):
@@ -304,7 +306,7 @@ def _may_show(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
             innermost = max(a * boxes[run, 0], a * boxes[run, 3]) + max(b * boxes[run, 1], b * boxes[run, 4])
             innermost += max(c * boxes[run, 2], c * boxes[run, 5]) + borders[k, 3] + borders[k, 4] * boxes[run, 6]
             within &= innermost > 0
-        for g in range(run * RUN, min((run + 1) * RUN, len(xyz)) if within else 0):
+        for g in range(run * GAUSSIANS_PER_BOX, min((run + 1) * GAUSSIANS_PER_BOX, len(xyz)) if within else 0):
             longest = max(scale[g, 0], scale[g, 1], scale[g, 2])
             within = True
             for k in range(len(borders)):
@@ -317,18 +319,18 @@ def _may_show(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
     """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
-    weight in pixels if nothing were in front, or (0,) if it is not asked for; returns keys (rows,) uint32: the bits of
-    the float32 depth, which is positive, and so in its order; CULLED of those without a pixel.
+    weight in pixels if nothing were in front, or (0,) if not needed; returns keys (rows,) uint32: the bits of the
+    float32 depth, which sort as depths do since these are positive; CULLED for those without a pixel.
     """
     keys = np.full(len(rows), CULLED)
     (xyz, scale, rotation, opacity, thickness), (pose, intrinsics, size, near) = shapes, seen_by
     fx, fy, cx, cy = intrinsics
     for i in prange(len(rows)):
         g = rows[i]
-        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        depth, tx, ty = depth_and_slopes(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
-        jx, jy = linearised_at(tx, ty, intrinsics, size)
+        jx, jy = clamped_slopes(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale, rotation, g, pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
         # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
@@ -352,8 +354,8 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
 
 @njit(cache=True, nogil=True)
 def ascending(keys):  # noqa: ANN001, ANN201
-    """Rows of uint32 keys from the least up, equal ones as they come, without CULLED: by 11 bits at a time, the last
-    first, a quarter of the time of a sort by comparison."""
+    """Rows of uint32 keys in ascending order, stable, without CULLED: a radix sort by 11 bits at a time, in a quarter
+    of the time of a sort by comparison."""
     order = np.flatnonzero(keys != CULLED).astype(np.int32)
     for shift in (0, 11, 22):
         place = np.zeros(2049, np.int64)
@@ -405,7 +407,7 @@ def _covariance(scale, rotation, g, pose, px, py, jx, jy):  # noqa: ANN001, ANN2
 
 @njit(cache=True, error_model="numpy")
 def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
-    """An axis of a Gaussian (unit, world) of that length in pixels of the image, linearised at (jx, jy)."""
+    """A Gaussian's axis (unit, world) times its length, in pixels of the image, linearised at (jx, jy)."""
     ex = length * (pose[0, 0] * axis[0] + pose[0, 1] * axis[1] + pose[0, 2] * axis[2])
     ey = length * (pose[1, 0] * axis[0] + pose[1, 1] * axis[1] + pose[1, 2] * axis[2])
     ez = length * (pose[2, 0] * axis[0] + pose[2, 1] * axis[1] + pose[2, 2] * axis[2])
@@ -415,22 +417,22 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
     """Members of every tile, of splats in order of depth: tile t holds members[starts[t]:starts[t + 1]]."""
-    tile_rows, log2_least = tiles // columns, np.log2(cutoffs.alpha_min)
+    tile_rows, log2_alpha_min = tiles // columns, np.log2(cutoffs.alpha_min)
     # The tile ranges side by side: every band reads all of them, twice.
     ranges = np.empty((len(splats), 4), np.int32)
     for i in prange(len(splats)):
         s = splats[i]
         ranges[i, 0], ranges[i, 1] = s.x0 // TILE, s.x1 // TILE + 1
         ranges[i, 2], ranges[i, 3] = s.y0 // TILE, s.y1 // TILE + 1
-    # First pass: how many splats each tile has. A band of rows of tiles is one thread's, so none writes to another's.
+    # First pass: count the splats of each tile. Each thread has its own band of tile rows, so none writes to another's.
     counts = np.zeros(tiles + 1, np.int64)
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
                 begin, end = ranges[i, 0], ranges[i, 1]
-                if end - begin > 2:  # of fewer, its box is the answer
-                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_least)
+                if end - begin > 2:  # for fewer, the box will do
+                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_alpha_min)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     # Second pass: the splats themselves, in order of depth as they come.
@@ -443,7 +445,7 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
                 begin, end = ranges[i, 0], ranges[i, 1]
                 if end - begin > 2:
-                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_least)
+                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_alpha_min)
                 for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = i
@@ -452,12 +454,12 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tiles_of_row(splats, place, row, begin, end, log2_least):  # noqa: ANN001, ANN202
-    """The columns of tiles that a splat's ellipse touches in a row of tiles, of those that its box does."""
+def _tiles_of_row(splats, place, row, begin, end, log2_alpha_min):  # noqa: ANN001, ANN202
+    """The columns of tiles, of those that its box touches, that a splat's ellipse touches in a row of tiles."""
     s = splats[place]
     # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
     # within the row of tiles where it comes nearest to that; its left end is the mirror image.
-    room, across, down = np.float64(s.peak) - log2_least, np.float64(s.across), np.float64(s.down)
+    room, across, down = np.float64(s.peak) - log2_alpha_min, np.float64(s.across), np.float64(s.down)
     slant = s.shear * across
     far = -slant * np.sqrt(room / down / (down + slant * slant))
     low = max(row * TILE + 0.5 - s.v, -np.sqrt(room / down))
@@ -494,7 +496,7 @@ def _entry_bounds(binned, masks, id_count):  # noqa: ANN001, ANN202
                 if masks[y, x] != last:
                     distinct, last = distinct + 1, masks[y, x]
         if distinct <= 4:
-            # Looking at every splat would save little memory here.
+            # A tighter bound, splat by splat, would save little memory here.
             bounds[tile] = (distinct + 1) * (starts[tile + 1] - starts[tile])
             continue
         total = 0
@@ -507,7 +509,7 @@ def _entry_bounds(binned, masks, id_count):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN001, ANN202
-    """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
+    """Blend every tile front to back and sum each splat's weights by mask; entries of tile t start at first[t].
 
     Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
     splats, starts, members, columns = binned
@@ -524,7 +526,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
         light, surface, shown = tile_buffer(), tile_buffer(), tile_buffer()
         runs = np.empty((TILE, TILE), np.uint8)
         batch = np.empty(BATCH, SPLAT)
-        # Light by more than rounding below: four splats of opacity 0.9 leave just the limit of 3DGS.
+        # Lower by more than rounding: four splats of opacity 0.9 leave just the limit of 3DGS.
         least = np.float32(np.log2(cutoffs.alpha_min)), np.float32(0.99999 * cutoffs.transmittance_min)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
@@ -533,7 +535,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
             entry = first[tile]
             for begin in range(starts[tile], starts[tile + 1], BATCH):
                 count = min(BATCH, starts[tile + 1] - begin)
-                for k in range(count):  # they lie all over memory: fetched at once, they do not wait for each other
+                for k in range(count):  # scattered in memory: fetched together, they do not wait for each other
                     batch[k] = splats[members[begin + k]]
                 for k in range(count):
                     s = batch[k]
@@ -552,7 +554,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
                     if through > 0.0:
                         rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
                         entry += 1
-                if not is_open(light, least[1]):
+                if not has_light(light, least[1]):
                     break
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts
@@ -560,7 +562,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
 
 @njit(cache=True, nogil=True)
 def tile_buffer():  # noqa: ANN201
-    """A number for each pixel of a tile; rows begin where vectors are read fastest."""
+    """(TILE * TILE,) float32, a number per pixel of a tile, aligned to cache lines."""
     room = np.empty(TILE * TILE + 16, np.float32)
     ahead = (64 - room.ctypes.data % 64) % 64 // 4
     return room[ahead : ahead + TILE * TILE]
@@ -568,8 +570,8 @@ def tile_buffer():  # noqa: ANN201
 
 @njit(cache=True, nogil=True)
 def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
-    """All light, no surface; pixels of a tile that are outside the image are dark. runs: (TILE, TILE) how many pixels
-    from each one on to the right have its id. Returns whether all pixels have one id."""
+    """Set light to 1 and surface to infinity; pixels of a tile outside the image get no light. runs: (TILE, TILE), set
+    to how many pixels from each one to the right have its id. Returns whether all pixels have one id."""
     one = True
     light[:] = np.float32(0)
     surface[:] = np.float32(np.inf)
@@ -585,53 +587,53 @@ def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _alpha_of_row(s, left, row, log2_least):  # noqa: ANN001, ANN202
-    """Alpha of a splat in the pixels of a tile's row, cut at both ends as in 3DGS; 0 where it does not reach."""
-    least = spread(log2_least)
+def _alpha_of_row(s, left, row, log2_alpha_min):  # noqa: ANN001, ANN202
+    """Alpha of a splat in a tile's row of pixels, clamped at both ends as in 3DGS; 0 where it does not reach."""
+    least = broadcast(log2_alpha_min)
     # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the center.
     dy = row + 0.5 - s.v
-    distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * spread(s.across)
-    log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+    distance = (iota() - broadcast(np.float32(s.u - s.shear * dy - left - 0.5))) * broadcast(s.across)
+    log_alpha = broadcast(np.float32(s.peak - s.down * dy * dy)) - distance * distance
     covers = log_alpha >= least
-    alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
-    return either(covers, alpha, spread(ZERO))
+    alpha = minimum(exp2(select(covers, log_alpha, least)), broadcast(np.float32(ALPHA_MAX)))
+    return select(covers, alpha, broadcast(ZERO))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blend(s, left, top, least, light, surface, shown):  # noqa: ANN001, ANN202
-    """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and that which shows through a surface.
+    """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and its part shown through a surface.
 
-    least: log2 of the alpha that counts, and light of a pixel that is not finished, at least.
+    least: log2 of the least alpha that counts, and the least light of a pixel that is not finished.
     light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
     transmittance below a half. shown: set to the weights in the rows of its box.
     """
-    none, full, half, never = spread(ZERO), spread(ONE), spread(HALF), spread(np.float32(np.inf))
-    depth, near_side = spread(s.depth), spread(s.surface)
+    none, full, half, never = broadcast(ZERO), broadcast(ONE), broadcast(HALF), broadcast(np.float32(np.inf))
+    depth, near_side = broadcast(s.depth), broadcast(s.surface)
     weight, through = none, none
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
         alpha = _alpha_of_row(s, left, top + y, least[0])
-        # Weight = transmittance before the splat times alpha, but for pixels that this splat would finish.
+        # Weight = transmittance before the splat times alpha, except in pixels that this splat would finish.
         before = load(light, y * TILE)
         after = before * (full - alpha)
-        goes_on = after >= spread(least[1])  # also where it is not covered and not finished
-        here = either(goes_on, before * alpha, none)
-        store(light, y * TILE, either(goes_on, after, none))
+        goes_on = after >= broadcast(least[1])  # also where it is not covered and not finished
+        here = select(goes_on, before * alpha, none)
+        store(light, y * TILE, select(goes_on, after, none))
         # The splat at which the transmittance falls below a half is the pixel's surface.
-        passed = either((before >= half) & (after < half), depth, never)
-        front = lesser(load(surface, y * TILE), passed)
+        passed = select((before >= half) & (after < half), depth, never)
+        front = minimum(load(surface, y * TILE), passed)
         store(surface, y * TILE, front)
         store(shown, y * TILE, here)
         weight = weight + here
-        through = through + either(near_side > front, here, none)
-    return total(weight), total(through)
+        through = through + select(near_side > front, here, none)
+    return lane_sum(weight), lane_sum(through)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def dim(s, left, top, log2_least, light):  # noqa: ANN001, ANN201
-    """Take from each pixel's light what a splat absorbs: `_blend` without asking whose it is."""
-    full = spread(ONE)
+def attenuate(s, left, top, log2_alpha_min, light):  # noqa: ANN001, ANN201
+    """Take from each pixel's light what a splat absorbs: `_blend` without the weights."""
+    full = broadcast(ONE)
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
-        store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y, log2_least)))
+        store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y, log2_alpha_min)))
 
 
 @njit(cache=True, nogil=True)
@@ -646,7 +648,7 @@ def _shows_one_mask(ids, runs, box):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _add_by_mask(ids, shown, box, sum_of, touched):  # noqa: ANN001, ANN202
-    """Add the weights of a box up by id; returns how many ids were touched, which ones is in ``touched``."""
+    """Sum the weights of a box by id; returns how many ids were touched, and writes them to ``touched``."""
     touches = 0
     x0, x1, y0, y1 = box
     for y in range(y0, y1):
@@ -662,19 +664,19 @@ def _add_by_mask(ids, shown, box, sum_of, touched):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def is_open(light, least):  # noqa: ANN001, ANN201
-    """Whether any pixel of a tile still has so much light."""
-    brightest = spread(ZERO)
+def has_light(light, least):  # noqa: ANN001, ANN201
+    """Whether any pixel of a tile still has at least this much light."""
+    brightest = broadcast(ZERO)
     for y in range(TILE):
         row = load(light, y * TILE)
-        brightest = either(row > brightest, row, brightest)
-    return any_of(brightest >= spread(least))
+        brightest = select(row > brightest, row, brightest)
+    return any_of(brightest >= broadcast(least))
 
 
 @njit(cache=True, nogil=True)
 def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
     """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
-    # Count the entries of each row, then put them there (a counting sort: tiles stay in order within a row).
+    # A counting sort by row: tiles stay in order within a row.
     start = np.zeros(row_count + 1, np.int64)
     for tile in range(len(first)):
         for e in range(first[tile], first[tile] + counts[tile]):
@@ -688,8 +690,8 @@ def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, A
             p = place[rows[e]]
             sorted_cols[p], sorted_weights[p] = cols[e], weights[e]
             place[rows[e]] = p + 1
-    # A Gaussian over a tile border has an entry from each tile: fold them together, row by row.
-    # ``where`` holds a Gaussian's place in the output; one from before this row's begin is of an earlier row.
+    # A Gaussian over a tile border has an entry from each tile: merge them, row by row.
+    # ``where`` holds a Gaussian's place in the output; a place before this row's begin is from an earlier row.
     where = np.full(n, -1, np.int64)
     indptr = np.zeros(row_count + 1, np.int32)
     out = 0

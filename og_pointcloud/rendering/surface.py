@@ -13,9 +13,9 @@ from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import with_needed_views
 from og_pointcloud.rendering.geometry import (
     Neighborhood,
-    along_curve,
-    distinct_places,
+    distinct_positions,
     isotropic,
+    morton_order,
     near_plane,
     neighborhood,
     thinned,
@@ -29,16 +29,15 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (in mode paper Gaussians all stay), in order of place. n below is the number of
-    its points.
+    scene: with one point per position (in mode paper all Gaussians stay), in Morton order; n points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
-    in their order.
+    in the same order.
     neighborhood: spacing and neighbors of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
-    stride: every stride-th row and column of the images is used; 1 but in mode paper.
-    by_sight: a view tells which mask a point lies in along the point's own ray (sightings.py); else, in mode paper, how
-    much each Gaussian paints of each mask (splatting.py).
+    stride: every stride-th row and column of the images is used; 1 except in mode paper.
+    by_sight: views assign points to masks along each point's own ray (sightings.py); else, in mode paper, by how much
+    each Gaussian paints of each mask (splatting.py).
     """
 
     scene: Scene
@@ -51,7 +50,7 @@ class Surface:
     by_sight: bool = False
 
     def of_points(self, values: NDArray[Any]) -> NDArray[Any]:
-        """What each point of the whole scene has, of values (n, ...) that the points here have."""
+        """Values (n, ...) of the points here, for each point of the whole scene."""
         return values if self.row_of_point is None else values[self.row_of_point]
 
     def thinned_views(self) -> list[View]:
@@ -63,11 +62,11 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     """Find the points that are needed, their spacing, and the Gaussians that they are drawn as."""
     is_paper = settings.mode == "paper"
     row_of_point = None
-    if not (is_paper and scene.points.are_gaussians):  # how these overlap is part of how they look
+    if not (is_paper and scene.points.are_gaussians):  # overlapping Gaussians look right only together
         scene, row_of_point = with_distinct_points(scene, journal)
     with journal.stage("spacing"):
-        scene, row_of_point = _in_order_of_place(scene, row_of_point)
-        if not is_paper:  # which has a choice of its own: so many steps, a view each
+        scene, row_of_point = _in_morton_order(scene, row_of_point)
+        if not is_paper:  # mode paper draws its own views, one per step
             scene = with_needed_views(scene, settings.geometry.enough_views, journal)
         near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighborhood(scene.points.xyz, settings.geometry)
@@ -83,31 +82,31 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
     """The scene with one point per position, and for each of its points the row that stands for it; None if all differ.
 
-    Of two points at the same position one would hide the other, which would then seem unseen. Their mean color counts,
-    whichever of them comes first. Gaussians are points at their centers: their shapes are made to look right together,
-    not to say where a surface is.
+    Of two points at the same position one would hide the other, which would then seem unseen. The row that stays has
+    their mean color. Gaussians become points at their centers: their shapes are made to look right together, not to say
+    where a surface is.
     """
     points = scene.points
     if points.are_gaussians:
         journal.leave_out(LeftOut.SHAPES)
         points = Points(points.xyz, points.origin, points.rgb)
         scene = replace(scene, points=points)
-    first, row_of_point = distinct_places(points.xyz)
+    first, row_of_point = distinct_positions(points.xyz)
     if len(first) == len(points):
         return scene, None
     journal.leave_out(LeftOut.COINCIDENT_POINTS, count=len(points) - len(first))
     distinct = points.take(first)
     if points.rgb is not None:
-        sums = [np.bincount(row_of_point, channel) for channel in points.rgb.T]  # of whole numbers: in any order exact
+        sums = [np.bincount(row_of_point, channel) for channel in points.rgb.T]  # of whole numbers: exact in any order
         colors = np.rint(np.stack(sums, axis=1) / np.bincount(row_of_point)[:, None])
         distinct = replace(distinct, rgb=colors.astype(np.uint8))
     return replace(scene, points=distinct), row_of_point
 
 
-def _in_order_of_place(scene: Scene, row_of_point: NDArray[np.int64] | None) -> tuple[Scene, NDArray[np.int64]]:
-    """The scene with its points along a curve through space, and where each is now: a twelfth of a fit's time is saved
-    by it, and ties are broken by place."""
-    order = along_curve(scene.points.xyz)
+def _in_morton_order(scene: Scene, row_of_point: NDArray[np.int64] | None) -> tuple[Scene, NDArray[np.int64]]:
+    """The scene with its points in Morton order, and each point's new row. It saves a twelfth of a fit's time, and
+    breaks ties by position."""
+    order = morton_order(scene.points.xyz)
     row = np.empty(len(order), np.int64)
     row[order] = np.arange(len(order))
     return replace(scene, points=scene.points.take(order)), row if row_of_point is None else row[row_of_point]
@@ -127,8 +126,8 @@ def _gaussians(scene: Scene, around: Neighborhood, settings: FitSettings, journa
 def sight_thickness(
     spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings
 ) -> NDArray[np.float32]:
-    """(n,) how far in front of a point others must lie to hide it, scene units: noise and overlap make a surface so
-    thick. At least a typical spacing counts, however dense points are."""
+    """(n,) how far in front of a point others must lie to hide it, scene units: the thickness that noise and overlap
+    give a surface. It follows from the point's spacing, or the typical one if that is larger."""
     return (settings.sight_thickness * np.maximum(spacing, typical_spacing)).astype(np.float32)
 
 
@@ -138,22 +137,22 @@ def surface_thickness(
 ) -> NDArray[np.float32]:  # fmt: skip
     """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick.
 
-    by_sight: of points that are asked along their own rays (`sight_thickness`).
+    by_sight: for points that are looked up along their own rays (`sight_thickness`).
     """
     if by_sight:
         return sight_thickness(spacing, typical_spacing, settings)
     # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
-    # so twice as thick, and a splat reaches three standard deviations beyond its center.
+    # hence twice the thickness; and a splat reaches three standard deviations beyond its center.
     with np.errstate(over="ignore"):  # a splat near float32's largest is infinitely thick
         thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
 
 
-def stride_for_pixels(views: Sequence[View], most: int, journal: Journal) -> int:
-    """The least stride that leaves the largest image no more than ``most`` pixels."""
+def stride_for_pixels(views: Sequence[View], max_pixels: int, journal: Journal) -> int:
+    """The least stride that leaves the largest image no more than ``max_pixels`` pixels."""
     largest = max(view.camera.width * view.camera.height for view in views)
     smallest = min(min(view.camera.width, view.camera.height) for view in views)  # a row and column of each stay
-    stride = min(max(1, int(np.ceil(np.sqrt(largest / most)))), smallest)
+    stride = min(max(1, int(np.ceil(np.sqrt(largest / max_pixels)))), smallest)
     if stride > 1:
-        journal.leave_out(LeftOut.PIXELS_IN_PAPER_MODE, share=1 - 1 / stride**2, most=most, stride=stride)
+        journal.leave_out(LeftOut.PIXELS_IN_PAPER_MODE, share=1 - 1 / stride**2, most=max_pixels, stride=stride)
     return stride
