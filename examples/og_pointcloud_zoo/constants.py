@@ -87,8 +87,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.view_reports.MAX_INDEPENDENT_VIEWS", "fitting.view_reports.PRIOR_COUNT",
         "fitting.view_reports.NO_MASK_LOG_PENALTY", "fitting.view_reports.BACKGROUND_LOG_PRIOR",
         "fitting.view_reports.SMOOTHNESS", "fitting.view_reports.MIN_COLOR_RATIO",
-        "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS", "rendering.geometry.FLOATER_SCATTER_SHARE",
-        "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS",
+        "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
+        "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
