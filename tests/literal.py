@@ -375,6 +375,30 @@ def _log_sum(exponents: Array) -> float:
     return float(exponents.max() + np.log(np.exp(exponents - exponents.max()).sum()))
 
 
+# Smoothed positions -------------------------------------------------------------------------------------------------
+
+
+def smoothed(xyz: Array, index: NDArray[np.integer], few: int, bias: float) -> Array:
+    """`smoothing.smoothed`, point by point in float64."""
+    xyz = np.array(xyz, np.float64)
+    moved = xyz.copy()
+    for g in range(len(xyz)):
+        noise = _plane(xyz[np.append(g, index[g, :few])])[0]
+        variance, height, normal = _plane(xyz[np.append(g, index[g])])
+        moved[g] -= min(1, bias * noise / variance) * height * normal
+    return moved
+
+
+def _plane(points: Array) -> tuple[float, float, Array]:
+    """Variance of points off the plane that fits them best, height of the first of them, and the plane's normal; the
+    farther a point is from the first, the less weight it has, the last one none."""
+    distance = np.linalg.norm(points - points[0], axis=1)
+    weight = 1 - (distance / distance[-1]) ** 2
+    mean = np.average(points, axis=0, weights=weight)
+    values, vectors = np.linalg.eigh(np.cov(points.T, aweights=weight, ddof=0))
+    return max(values[0], 0), (points[0] - mean) @ vectors[:, 0], vectors[:, 0]
+
+
 # Losses of one view, paper, Eq. 1 and 2 ----------------------------------------------------------------------------
 
 

@@ -52,6 +52,10 @@ MUTATIONS = (
         "np.median(front)) if len(front)", "np.max(front)) if len(front)", ("test_geometry.py",),
     ),
     Mutation(
+        "what bends is taken for noise", "rendering/smoothing.py",
+        "min(1.0, NOISE_BIAS * noise / variance) * height", "height", ("test_smoothing.py",),
+    ),
+    Mutation(
         "layers of one surface hide each other", "rendering/sightings.py",
         "surface[k] = splats[of_tile[k]].surface", "surface[k] = splats[of_tile[k]].depth", ("test_sightings.py",),
     ),

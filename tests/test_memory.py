@@ -110,7 +110,7 @@ def test_a_full_disk_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.Monk
     with monkeypatch.context() as patch, WorkFolder.open(tmp_path / "work") as work:
         patch.setattr("numpy.lib.format.write_array", full)
         with pytest.raises(OgPointcloudError, match=r"work/a-1.*cannot be written \(No space left.*larger disk"):
-            work.array("a", "1", lambda: np.zeros(3))
+            work.arrays("a", "1", lambda: [np.zeros(3)])
     monkeypatch.setattr(memory_module, "_reserve", full)
     with pytest.raises(OgPointcloudError, match=r"no room for 0.0 GB in.*No space left.*TMPDIR"):
         scratch_array(3, np.int32)
@@ -210,14 +210,14 @@ def test_held_arrays_are_written_when_they_are_many_or_old(tmp_path: Path) -> No
     with killed_run(folder) as work:
         work.hold(2 * ARRAYS[0].nbytes, 1000)
         for number in range(2):
-            work.array("view", str(number), lambda: ARRAYS[0])
+            work.arrays("view", str(number), lambda: [ARRAYS[0]])
         assert kept_files(folder) == 0
-        work.array("view", "2", lambda: ARRAYS[0])
+        work.arrays("view", "2", lambda: [ARRAYS[0]])
         assert kept_files(folder) == 3
-        work.array("view", "3", lambda: ARRAYS[0])
+        work.arrays("view", "3", lambda: [ARRAYS[0]])
         assert kept_files(folder) == 4
         work.hold(np.inf, -1)
-        work.array("view", "4", lambda: ARRAYS[0])
+        work.arrays("view", "4", lambda: [ARRAYS[0]])
         assert kept_files(folder) == 5
 
 
@@ -226,7 +226,7 @@ def test_a_temporary_folder_goes_in_any_case(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("tempfile.tempdir", None)
     with killed_run(None) as work:
         assert not list(tmp_path.iterdir())
-        work.array("view", "1", lambda: ARRAYS[0])
+        work.arrays("view", "1", lambda: [ARRAYS[0]])
         assert len(list(tmp_path.glob("*/view*"))) == 1
     assert not list(tmp_path.iterdir())
 

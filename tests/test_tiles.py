@@ -201,7 +201,8 @@ def test_photographs_that_cannot_be_read_are_counted(most):
 
 def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
     cloud = TiledCloud.cut(points, len(points), SETTINGS, work)
-    work.array("spacing", cloud.key, lambda: np.full((2, len(points)), spacing, np.float32))
+    spacings = np.full((2, len(points)), spacing, np.float32)
+    work.arrays("spacing", cloud.key, lambda: [spacings, cloud.points.xyz])
     return cloud
 
 

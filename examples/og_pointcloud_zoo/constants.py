@@ -60,6 +60,8 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.association.DOMINANT_WEIGHT_RATIO": ("", ()),
     "rendering.sightings.MIN_OPENNESS": ("table", ("_trace_openness",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
+    "rendering.smoothing.NOISE_NEIGHBORS": ("table", ("_smoothed",)),
+    "rendering.smoothing.NOISE_BIAS": ("table", ("_smoothed",)),
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
 """Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
@@ -89,7 +91,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "fitting.view_reports.SMOOTHNESS", "fitting.view_reports.MIN_COLOR_RATIO",
         "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS",
         "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
-        "rendering.sightings.RING_SHARE",
+        "rendering.sightings.RING_SHARE", "rendering.smoothing.NOISE_NEIGHBORS", "rendering.smoothing.NOISE_BIAS",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""

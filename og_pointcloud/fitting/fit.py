@@ -26,6 +26,7 @@ from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
 from og_pointcloud.rendering.geometry import drawn_spacing, isotropic, thinned
+from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
@@ -119,7 +120,7 @@ def prepare(
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
     _check(scene, journal)
-    surface = _with_best_scale(reconstruct_surface(scene, settings, journal), settings, journal)
+    surface = _as_drawn(reconstruct_surface(scene, settings, journal), settings, journal)
     with WorkFolder.open(None) if work is None else nullcontext(work) as kept:
         return Prepared(scene, surface, _mask_table(surface, settings, journal, kept))
 
@@ -174,8 +175,8 @@ def _check(scene: Scene, journal: Journal) -> None:
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
-def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
-    """The surface with points drawn as large as held-out views find best."""
+def _as_drawn(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
+    """The surface with points as large as held-out views find best, and at smoothed positions."""
     # Mode paper draws points as full as trained Gaussians are.
     if not surface.by_sight:
         return surface
@@ -184,7 +185,10 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
     with journal.stage("point size"):
         choice = choose_scale(points, spacing, surface.thickness, surface.scene.views, surface.near, settings, journal)
         note_scale(choice, journal)
-    return replace(surface, gaussians=isotropic(points, spacing, choice.scale, settings.geometry.opacity))
+        # Only now: sizes that agree about as well as each other would change places with every small move of points.
+        points = replace(points, xyz=smoothed(points.xyz, surface.neighborhood))
+    drawn = isotropic(points, spacing, choice.scale, settings.geometry.opacity)
+    return replace(surface, scene=replace(surface.scene, points=points), gaussians=drawn)
 
 
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -69,9 +69,9 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 class TiledCloud:
     """A cloud in the order of its tiles, read-only. Made by `TiledCloud.cut`.
 
-    points, spacing (n,): spacing only once a stage has put it into the work folder. members: per tile, its points and
-    those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths in the scene's unit. key:
-    fingerprint of points, tiles and settings. work: where all of it is, for other processes too.
+    points, spacing (n,), drawn_points: the last two only once a stage has put them into the work folder. members: per
+    tile, its points and those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths in the
+    scene's unit. key: fingerprint of points, tiles and settings. work: where all of it is, for other processes too.
     """
 
     def __init__(self, work: WorkFolder, key: str) -> None:
@@ -109,12 +109,17 @@ class TiledCloud:
     @cached_property
     def spacing(self) -> NDArray[np.float32]:
         """(n,) float32, as `Neighborhood.spacing`."""
-        return self.work.array("spacing", self.key, vanished)[0]
+        return self.work.arrays("spacing", self.key, vanished)[0][0]
 
     @cached_property
     def drawn_spacing(self) -> NDArray[np.float32]:
         """(n,) float32, as `geometry.drawn_spacing`."""
-        return self.work.array("spacing", self.key, vanished)[1]
+        return self.work.arrays("spacing", self.key, vanished)[0][1]
+
+    @cached_property
+    def drawn_points(self) -> Points:
+        """The points at the positions at which they are drawn (smoothing.py)."""
+        return replace(self.points, xyz=self.work.arrays("spacing", self.key, vanished)[1])
 
     def inner(self, tile: int) -> slice:
         """The slice of a tile's members that are its own points, not its margin's."""

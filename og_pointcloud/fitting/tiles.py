@@ -61,6 +61,7 @@ from og_pointcloud.rendering.geometry import (
     position_hash,
     sample_of_points,
 )
+from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
 from og_pointcloud.rendering.surface import sight_thickness, with_distinct_points
 from og_pointcloud.scene import Camera, Scene, View
@@ -88,6 +89,7 @@ POINT_CLOUD_BYTES = 120
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Rows = NDArray[np.integer]
+Floats = NDArray[np.float32]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
 """What a view with M masks shows of a point. Row < M: weight in that mask. M: weight in none. M + 1: exposure. M + 2:
@@ -134,7 +136,7 @@ def fit_tiles(
         journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in cloud.margins]
         spacing = partial(_spacing, cloud, settings)
         parts = range(len(cloud.tiles))
-        work.array("spacing", cloud.key, lambda: np.concatenate(run(spacing, parts, "spacing"), axis=1))
+        work.arrays("spacing", cloud.key, lambda: _of_all_tiles(run(spacing, parts, "spacing")))
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
@@ -174,10 +176,17 @@ def _points_per_tile(points: int, left: int) -> int:
     return min(MIN_TILE_POINTS << (fitting // MIN_TILE_POINTS).bit_length() - 1, MAX_TILE_POINTS)
 
 
-def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
-    """(2, points of the tile) their spacing, and the spacing that they are drawn by."""
-    around, members = cloud.neighbors(tile, settings.geometry), cloud.members[tile]
-    return np.stack([around.spacing, drawn_spacing(cloud.points.xyz[members], around)])[:, cloud.inner(tile)]
+def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> tuple[Floats, Floats]:
+    """(2, points of the tile) their spacing, and the spacing that they are drawn by; (points of the tile, 3) the
+    positions at which they are drawn."""
+    around, inner = cloud.neighbors(tile, settings.geometry), cloud.inner(tile)
+    xyz = cloud.points.xyz[cloud.members[tile]]
+    return np.stack([around.spacing, drawn_spacing(xyz, around)])[:, inner], smoothed(xyz, around)[inner]
+
+
+def _of_all_tiles(parts: Sequence[tuple[Floats, Floats]]) -> list[Floats]:
+    spacings, positions = zip(*parts, strict=True)
+    return [np.concatenate(spacings, axis=1), np.concatenate(positions)]
 
 
 # Views ----------------------------------------------------------------------------------------------------------
@@ -194,7 +203,7 @@ class _Drawing:
 
     def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32], opacity: float) -> Gaussians:
         """Splats of some points, each enlarged by the factor ``larger``."""
-        return isotropic(cloud.points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, opacity)
+        return isotropic(cloud.drawn_points.take(rows), cloud.drawn_spacing[rows] * larger, self.scale, opacity)
 
 
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
@@ -335,7 +344,7 @@ def _entries(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
     exposure = front.exposure
-    distance, colors = differences(cloud.points.take(rows), view, drawing.near, exposure.indices, exposure.data)
+    distance, colors = differences(cloud.drawn_points.take(rows), view, drawing.near, exposure.indices, exposure.data)
     difference = csr_array((1 + distance.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape)
     # Blocks of rows, as ENTRY numbers them: masks, outside, exposure, exposure through holes, differences of color.
     masks = view.mask_count
@@ -374,7 +383,7 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
     to fall to ALPHA_MIN. The projection is linearized within a margin of the image: there a round one is widened.
     """
-    points, spacing, size_of = cloud.points, cloud.spacing[part], drawing.scale * cloud.drawn_spacing[part]
+    points, spacing, size_of = cloud.drawn_points, cloud.spacing[part], drawing.scale * cloud.drawn_spacing[part]
     with np.errstate(divide="ignore", invalid="ignore"):
         uv_px, depth = camera.project(points.xyz[part])
         focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])

@@ -142,10 +142,6 @@ class WorkFolder:
             return found
         return self._keep(label, tuple(make()))
 
-    def array(self, name: str, key: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """As `arrays`, for a single one."""
-        return self.arrays(name, key, lambda: [make()])[0]
-
     def replace(self, name: str, key: str, arrays: Sequence[NDArray[Any]]) -> None:
         """From now on `arrays` gives these: a checkpoint of work that goes on. They must not change afterwards.
 

@@ -29,10 +29,11 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (in mode paper all Gaussians stay), in Morton order; n points.
+    scene: with one point per position (in mode paper all Gaussians stay), in Morton order; n points, at the positions
+    at which they are drawn (smoothing.py).
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in the same order.
-    neighborhood: spacing and neighbors of the n points. gaussians: how the n points are drawn.
+    neighborhood: spacing and neighbors of the n points as measured. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
     stride: every stride-th row and column of the images is used; 1 except in mode paper.
