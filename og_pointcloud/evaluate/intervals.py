@@ -50,10 +50,9 @@ class BlockInterval(Interval):
 
 
 def bootstrap(scores: NDArray[np.floating]) -> Interval:
-    """Interval of the mean of n items' scores (scenes, or frame-object pairs): items are resampled with
-    replacement.
+    """Interval of the mean of n items' scores (scenes, or frame-object pairs), resampled with replacement.
 
-    An item with NaN has no score and is left out first. One item alone has no spread; none at all is an error.
+    An item with NaN has no score and is left out first. A single item has no spread; no item is an error.
     """
     values = np.asarray(scores, np.float64)
     values = values[np.isfinite(values)]
