@@ -129,7 +129,7 @@ class OnnxModel:
     """An exported image encoder (an `ImageModel`), run by onnxruntime."""
 
     def __init__(self, folder: StrPath) -> None:
-        """folder: written by ``og-pointcloud export image``; OgPointcloudError where it is damaged or something else."""
+        """folder: written by ``og-pointcloud export image``; OgPointcloudError if it is damaged or something else."""
         self.where = str(folder)
         files = ENCODER.read(Path(folder))
         self.manifest = ENCODER.checked(files, self.where, self._take)

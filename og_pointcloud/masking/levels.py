@@ -29,8 +29,8 @@ VISIBLE_SHARE = 0.3
 
 
 def masks_of_level(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[np.intp]]:
-    """(H, W) int32: -1 outside every mask of this level of `PARTS_WEIGHT`, else 0..K-1 by descending score; and (K,) the
-    proposal of each id."""
+    """(H, W) int32: -1 outside every mask of this level of `PARTS_WEIGHT`, else 0..K-1 by descending score; and (K,)
+    the proposal of each id."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # better first, then smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)

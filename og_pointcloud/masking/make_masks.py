@@ -43,8 +43,8 @@ PREVIEW_IMAGES = 4
 
 @dataclass(frozen=True)
 class MasksMade:
-    """images: number used; done_before: number of these that an interrupted run had done. masks: total number. left_out:
-    names of images that were not used. seconds: wall clock."""
+    """images: number used; done_before: number of these that an interrupted run had done. masks: total number.
+    left_out: names of images that were not used. seconds: wall clock."""
 
     output: Path
     images: int

@@ -116,8 +116,8 @@ def open_proposer(text: str, words: Sequence[str] = (), images_before: int | Non
 
 
 def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
-    """Each task's error, or None, in the order of the tasks. Without tasks no model is opened. done: number of images of
-    earlier runs."""
+    """Each task's error, or None, in the order of the tasks. Without tasks no model is opened. done: number of images
+    of earlier runs."""
     if tasks:
         with ThreadPoolExecutor(settings.threads) as pool:  # on early exit, it waits for the images in progress
             yield from pool.map(ImageWorker(settings, done), tasks)
