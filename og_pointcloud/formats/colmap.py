@@ -1,7 +1,7 @@
 """COLMAP sparse models, .bin and .txt: world-to-camera poses, OpenCV axes, pixel centers at +0.5 as in the scene.
 
 Layout: https://colmap.github.io/format.html. Binary files are little endian: a count (uint64), then the records. Text
-files have a record a line, ``#`` for comments. Where both are present the binary files are read, as COLMAP does.
+files have one record per line, ``#`` for comments. If both are present, the binary files are read, as in COLMAP.
 
 Since 3.12 a model may have rigs and frames files. They are not needed: the images file still has all poses.
 """
@@ -46,7 +46,7 @@ CAMERA_MODELS: dict[str, tuple[int, str]] = {
     "EUCM": (16, "fx fy cx cy alpha beta"),
     "EQUIRECTANGULAR": (17, "w h"),
 }
-"""COLMAP's ids and parameters. RAD_TAN_THIN_PRISM_FISHEYE (11) alone is refused."""
+"""COLMAP's ids and parameters. Only RAD_TAN_THIN_PRISM_FISHEYE (11) is refused."""
 LENS_MODELS = {"FOV": "fov", "DIVISION": "division", "SIMPLE_DIVISION": "division", "EUCM": "extended"}
 MODEL_NAMES = {model_id: name for name, (model_id, _) in CAMERA_MODELS.items()}
 

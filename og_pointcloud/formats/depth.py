@@ -98,8 +98,8 @@ def find_depth(capture: Path, name: str) -> Path | None:
 def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
     """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 outside its view.
 
-    Between two pinholes with one center and one orientation, a column depends on the column alone and a row on the row
-    alone, so whole lines are picked; by nearest pixel, as depths must not be blended across an edge.
+    Between two pinholes with one center and one orientation, columns depend only on columns and rows only on rows,
+    so whole lines are picked; by nearest pixel, as depths must not be blended across an edge.
     """
     columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
     rows = _positions(target.height, target.fy, target.cy, source.fy, source.cy)

@@ -160,7 +160,7 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
     """(H, W) bool: of every ``step``-th reading along each axis, those on one surface with a neighbor in their row and
     in their column. slanted: readings on a surface seen at a flatter angle count too, if they are among LINE_READINGS
-    on a line. A map takes these, as it knows what its frames measured; in a fused cloud such points would hide each
+    on a line. A map uses these, as it knows what its frames measured; in a fused cloud such points would hide each
     other from a fit."""
     steepest = MAX_SLOPE / image.camera.fx, MAX_SLOPE / image.camera.fy
     return _on_surface(image.depth, step, steepest, NOISE_TOLERANCE * noise, slanted)
@@ -268,7 +268,7 @@ def _judge(
         _add_votes(xyz, seen_from, depths, limits, votes, shift)
     confirmed, refuted, could_see = votes.T
     stays = (confirmed > refuted) & (confirmed >= np.where(could_see >= 3, 2, 1))
-    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)  # weight 0: no shift either
+    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)  # weight 0: shift 0
 
 
 @njit(cache=True, parallel=True)

@@ -7,7 +7,7 @@ Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_
                 ``intrinsics``, 9 numbers; ``depth_00000.png``, millimeters. Most poses have no image.
 ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_wide_intrinsics/*.pincam`` (width height
                 fx fy cx cy) and ``lowres_wide.traj``: time, rotation vector, translation, world to camera, OpenCV's
-                axes. An image takes the pose whose time is nearest, if that is within 10 ms.
+                axes. An image gets the pose nearest in time, if within 10 ms.
 
 Image and depth image differ in size but share a lens. Worlds are in meters and kept as they are, so that clouds
 exported by the apps (y up) fit. Images are in the sensor's landscape orientation, however the phone was held.
