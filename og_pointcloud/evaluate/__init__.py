@@ -1,1 +1,1 @@
-"""Scores by the protocols of published tables, how sure they are, and sweeps of settings: error against run time."""
+"""Scores by the protocols of published tables, their intervals, and sweeps of settings: error against run time."""

@@ -1,8 +1,8 @@
-"""A labelled scene against its capture's own truth: labels, how sure their score is, what abstaining buys, instances.
+"""A labelled scene against its capture's ground truth: scores of labels, their intervals, and scores of instances.
 
 Labels are scored as everywhere in this library: a point without a label is a miss, a class called on known background
-a false alarm. Beside that stand the answered points alone. Intervals are over blocks of space (`intervals`). Where the
-truth knows instances, the scene's are compared with them as partitions of the points.
+a false alarm. Labelled points are also scored alone, to show the effect of abstaining. Intervals are over blocks of
+space (`intervals`). If the truth has instances, the scene's are compared with them as partitions of the points.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from og_pointcloud.evaluate.truth import Truth
 
 @dataclass(frozen=True)
 class Answer:
-    """A scene's answer for each of its points. called: (n,) classes of the truth, -1 unknown, len(names) a word that
-    the truth lacks. instances: (n,), below 0 none. xyz: (n, 3). spacing: of the points, in their unit."""
+    """A scene's answer for each of its points. called: (n,) classes of the truth, -1 unknown, len(names) for a word
+    that the truth lacks. instances: (n,), below 0 none. xyz: (n, 3). spacing: point spacing, in their unit."""
 
     called: NDArray[np.integer]
     instances: NDArray[np.integer]
@@ -33,10 +33,10 @@ class Answer:
 
 @dataclass(frozen=True)
 class CaptureScore:
-    """labels: unknown counts as wrong. interval: of its mIoU. answered: points with a label alone, over the classes
-    present among them, background left out; answered_share: of the scored points. rand: adjusted Rand index of the
-    instances, over points of things whose class is known, points without an instance being one part; None where the
-    truth knows no such things."""
+    """labels: unknown counts as wrong. interval: of its mIoU. answered: only points with a label, over the classes
+    present among them, without background; answered_share: of the scored points. rand: adjusted Rand index of the
+    instances, over points of things with a known class, where points without an instance form one part; None where the
+    truth has no such things."""
 
     labels: Score
     interval: BlockInterval
@@ -46,7 +46,7 @@ class CaptureScore:
 
 
 def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> Answer:
-    """Ask a scene for the names of text_features, or for all of its own words. SceneError where its points are not
+    """Label a scene with the names of text_features, or with all of its own words. SceneError where its points are not
     those of the truth."""
     scene = as_scene(scene)
     cloud = scene.cloud

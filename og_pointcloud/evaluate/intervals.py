@@ -1,13 +1,12 @@
-"""How sure a score is: bootstrap intervals.
+"""Bootstrap intervals of scores.
 
-Scenes, or pairs of frame and object, are items that are drawn again one by one (`bootstrap`). The points of one cloud
-are not: an instance with a wrong label is wrong at all of its points, and an interval from points drawn one by one
-would be many times too narrow. For the mean IoU of one cloud whole cubes of space are drawn again instead
-(`miou_interval`). How large a cube must be to hold what errs together is not known, so it is tried: edges double from 8
-point spacings while half of the classes or more lie in at least 20 cubes each, and the widest of their intervals is the
-one given. With larger cubes many draws would hold nothing of a class but its fringe, and their mean would be another
-figure than the score. Classes are those of the whole cloud; a draw without a point of a class, called or true, leaves
-that class out.
+Scenes, or pairs of frame and object, are resampled one by one (`bootstrap`). Points of one cloud are not: an instance
+with a wrong label is wrong at all of its points, so an interval from points drawn one by one would be many times too
+narrow. For the mean IoU of one cloud, whole cubes of space are resampled instead (`miou_interval`). How large a cube
+must be to hold correlated errors is unknown, so several are tried: edges double from 8 point spacings while at least
+half of the classes lie in at least 20 cubes each, and the widest of the intervals is returned. With larger cubes, many
+draws would hold only the fringe of a class, and their mean would no longer estimate the score. Classes are those of the
+whole cloud; a draw without a point of a class, called or true, leaves that class out.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ Integers = NDArray[np.integer]
 
 DRAWS, BLOCK_DRAWS = 10_000, 2_000
 NUMBERS_PER_CHUNK = 1 << 21
-"""Numbers drawn at once, which bounds the memory."""
+"""Numbers drawn at once; bounds memory."""
 MIN_EDGE_SPACINGS = 8.0
 """Edge of the smallest cubes tried, in point spacings."""
 MIN_BLOCKS = 20
-"""Cubes that the median class must lie in, or cubes are too large."""
+"""If the median class lies in fewer cubes, they are too large."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +43,16 @@ class Interval:
 
 @dataclass(frozen=True)
 class BlockInterval(Interval):
-    """mean: of all points. edge: of a cube, in scene units. blocks: how many cubes."""
+    """mean: of all points. edge: of a cube, in scene units. blocks: number of cubes."""
 
     edge: float
     blocks: int
 
 
 def bootstrap(scores: NDArray[np.floating]) -> Interval:
-    """Interval of the mean of n items' scores (scenes, or frame-object pairs): items are redrawn with replacement.
+    """Interval of the mean of n items' scores (scenes, or frame-object pairs), resampled with replacement.
 
-    An item with NaN has no score and is left out first. One item alone has no spread; none at all is an error.
+    An item with NaN has no score and is left out first. A single item has no spread; no item is an error.
     """
     values = np.asarray(scores, np.float64)
     values = values[np.isfinite(values)]
@@ -68,11 +67,11 @@ def miou_interval(
     called: Integers, truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
     less: Integers | None = None,
 ) -> BlockInterval:  # fmt: skip
-    """Interval of the mean IoU that `score_labels` gives; or of its difference, ``called`` minus ``less``, to another
-    labelling's. Both are then scored on the same draws, since what is hard for one is hard for the other.
+    """Interval of the mean IoU of `score_labels`; or of the difference between two labellings, ``called`` minus
+    ``less``. Both are then scored on the same draws, since what is hard for one is hard for the other.
 
     called, less: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points,
-    same unit. classes: those that the score is a mean over; OgPointcloudError without one.
+    same unit. classes: those that the score averages; OgPointcloudError if there are none.
     """
     if not classes:
         raise OgPointcloudError("no class has points enough to be scored, so their mean has no interval; expected one")
@@ -85,10 +84,10 @@ def miou_interval(
     while True:
         block = _cubes(points, edge)
         present = _points_per_block(block, true, classes)
-        # Too large by now: of the edges tried, the widest interval is the answer. The smallest edge always counts.
+        # Cubes are too large now: return the widest interval so far. The smallest edge is always used.
         if intervals and np.median((present > 0).sum(axis=0)) < MIN_BLOCKS:
             return max(intervals, key=lambda interval: interval.high - interval.low)
-        # IoU of a draw needs only sums over its blocks, of intersections and of unions, (blocks, classes) each.
+        # IoU of a draw only needs sums of intersections and unions over its blocks, (blocks, classes) each.
         hits = [_points_per_block(block, np.where(labels == true, true, -1), classes) for labels in labellings]
         unions = [
             present + _points_per_block(block, labels, classes) - hit
@@ -100,13 +99,13 @@ def miou_interval(
 
 def _cubes(xyz: Doubles, edge: float) -> NDArray[np.intp]:
     """(n,) the cube that each point lies in, numbered from 0."""
-    # 21 bits a coordinate; what lies farther out than 2^20 cubes shares the last one.
+    # 21 bits per coordinate; points farther out than 2^20 cubes share the last one.
     cube = np.floor(np.minimum((xyz - xyz.min(axis=0)) / edge, 1 << 20)).astype(np.int64)
     return np.unique((cube[:, 0] << 42) | (cube[:, 1] << 21) | cube[:, 2], return_inverse=True)[1]
 
 
 def _points_per_block(block: NDArray[np.intp], ids: Integers, classes: tuple[int, ...]) -> Doubles:
-    """(blocks, classes) how many points of each block have each class. block, ids: (n,)."""
+    """(blocks, classes) number of points of each class in each block. block, ids: (n,)."""
     counts = np.zeros((int(block.max()) + 1, len(classes)))
     for column, class_id in enumerate(classes):
         counts[:, column] = np.bincount(block[ids == class_id], minlength=len(counts))
@@ -128,7 +127,7 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockI
 
     drawn = []
     for picked in _draws(blocks, BLOCK_DRAWS):
-        # How often each draw has each block: one histogram of the pairs (draw, block).
+        # How often each draw contains each block: one histogram of the pairs (draw, block).
         rows = np.arange(len(picked))[:, None] * blocks + picked
         weights = np.bincount(rows.ravel(), minlength=picked.size).reshape(picked.shape)
         drawn.append(score(weights.astype(np.float64)))
@@ -137,7 +136,7 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockI
 
 
 def _draws(items: int, draws: int) -> Iterator[NDArray[np.int64]]:
-    """(some draws, items) rows of items drawn with replacement, in parts that fit into memory; always the same."""
+    """(some draws, items) rows of items drawn with replacement, in parts that fit into memory; the seed is fixed."""
     random = np.random.default_rng(0)
     step = max(1, NUMBERS_PER_CHUNK // items)
     for start in range(0, draws, step):

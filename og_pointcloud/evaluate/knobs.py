@@ -1,6 +1,6 @@
-"""What a sweep tries: the settings that trade error for time.
+"""The settings that a sweep tries, which trade error for time.
 
-A knob is a list of named values; each value is a whole `FitSettings`, so that whatever a fit can be told can be a knob.
+A knob is a list of named values; each value is a whole `FitSettings`, so that any setting of a fit can be a knob.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from og_pointcloud.settings import FitSettings
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of one knob. every: each every-th view of the capture is used, 1 for all."""
+    """One value of one knob. every: one in this many views of the capture is used, 1 for all."""
 
     knob: str
     value: str
@@ -29,9 +29,9 @@ class Setting:
 
 
 def changed(record: Any, path: str, value: Any) -> Any:
-    """A settings record in which one number, at any depth, is another: ``changed(settings, "geometry.neighbors", 8)``.
+    """A settings record with one number, at any depth, replaced: ``changed(settings, "geometry.neighbors", 8)``.
 
-    TypeError or AttributeError for a path that names none.
+    TypeError or AttributeError for a path that does not exist.
     """
     name, _, rest = path.partition(".")
     return replace(record, **{name: changed(getattr(record, name), rest, value) if rest else value})
@@ -48,7 +48,7 @@ NUMBERS: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),
     "sure share": ("membership.sure_share", (0.4, 0.6, 0.8)),
 }
-"""Knob -> the setting that it sets, and the values tried."""
+"""Knob -> the setting that it changes, and the values tried."""
 
 
 def _label(value: Any) -> str:
@@ -61,7 +61,7 @@ KNOBS = {"views": tuple(Setting("views", f"one of {n}" if n > 1 else "all", ever
 }
 """Name -> values, one of which is the default."""
 QUICK_KNOBS = ("mode", "views", "grouping sample")
-"""Knobs of a report in a hurry."""
+"""Knobs of a quick report."""
 
 
 def settings_of(knobs: tuple[str, ...] | None = None) -> list[Setting]:

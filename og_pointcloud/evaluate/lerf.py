@@ -1,18 +1,17 @@
 """LeRF-OVS object selection, from the data set's own folders: select by text, render the selection, compare outlines.
 
-``DIR/label/<scene>/frame_00041.json`` are the outlines of the objects that are asked for, ``DIR/<scene>/sparse/0`` the
-poses.
+``DIR/label/<scene>/frame_00041.json`` has the outlines of the queried objects, ``DIR/<scene>/sparse/0`` the poses.
 
-Rules. A text selects Gaussians, these alone are rendered, and where their alpha is above 0.7 is the predicted mask. A
+Rules. A text selects Gaussians, only these are rendered, and the predicted mask is where their alpha is above 0.7. A
 (frame, object) pair scores the IoU with the outlined mask, 0 where nothing is selected or rendered; several outlines of
 one category in a frame are one object. mIoU is the mean over a scene's pairs, accuracy the share of pairs with an IoU
 above 0.25; the table's figure is the mean of the four scenes (macro).
 
-What a text selects is asked in two ways, whose scores stand side by side, since choosing is where most is lost:
+A text selects in two ways, scored side by side, since selection is where most is lost:
 
-    best         the one instance that the text fits best, whatever its score: no threshold, and no "nothing"
+    best         the one instance that the text fits best, whatever its score: no threshold, never nothing
     calibrated   the instances that the text fits better than the everyday words of the scene's word bank; may be none.
-                 Without a bank, the best
+                 Without a bank, as best
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import TextFeatures
 
 MIN_ALPHA, MIN_IOU = 0.7, 0.25
-"""The protocol's bounds, see above: of a rendered pixel's alpha, and of a pair's IoU for accuracy."""
+"""The protocol's bounds (see above): alpha of a rendered pixel, and IoU of a pair for accuracy."""
 PUBLISHED_PAIRS = 208
 """(frame, object) pairs of the published table, in four scenes."""
 WAYS = ("best", "calibrated")
 LABEL_FOLDER = "label"
 MAX_OFFSET_SPACINGS = 0.01
-"""Share of the point spacing by which a fitted cloud and its Gaussians may lie apart."""
+"""Share of the point spacing by which a fitted cloud and its Gaussians may differ."""
 
 Alpha = NDArray[np.floating]
 
@@ -64,7 +63,7 @@ class LabelledFrame:
 
 @dataclass(frozen=True)
 class LerfScene:
-    """A scene's labelled frames, and the camera of each, from world coordinates, at the size of its label."""
+    """A scene's labelled frames, and the camera of each, from world coordinates, at the size of its label image."""
 
     name: str
     frames: tuple[LabelledFrame, ...]
@@ -78,7 +77,7 @@ class LerfScene:
 
 @dataclass(frozen=True)
 class PairScore:
-    """A (frame, object) pair. iou: by way."""
+    """A (frame, object) pair. iou: by way of selecting."""
 
     frame: str
     object: str
@@ -153,14 +152,14 @@ def _filled(outline: Any, shape: tuple[int, int], source: str) -> NDArray[np.boo
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise SceneError(f"{source}: the outline is {outline!r:.60}; expected at least three [x, y]")
     mask = np.zeros(shape, np.uint8)
-    limit = 1 << 20  # OpenCV takes 32-bit integers; what lies this far outside the image is cut off either way
+    limit = 1 << 20  # OpenCV takes 32-bit integers; points this far outside the image are clipped either way
     require_cv2().fillPoly(mask, [np.clip(np.rint(corners), -limit, limit).astype(np.int32)], 1)
     return mask.astype(bool)
 
 
 def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
-    """The cloud's points as splats, in its local frame: those of the file that it was fitted from. SceneError where the
-    file is another cloud's."""
+    """The cloud's Gaussians, in its local frame, from the file that it was fitted from. SceneError where the file
+    belongs to another cloud."""
     points = read_points(file)
     gaussians = Gaussians.from_points(points)
     if len(points) != len(cloud):
@@ -177,14 +176,14 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
 def score_pairs(
     scene: LabelledScene, labels: LerfScene, gaussians: Gaussians, text_features: TextFeatures = None
 ) -> list[PairScore]:
-    """The IoU of every (frame, object) pair, in every way.
+    """The IoU of every (frame, object) pair, for every way of selecting.
 
-    gaussians: of the scene's points (`gaussians_of`). text_features: where the objects' names are found; left out, the
+    gaussians: of the scene's points (`gaussians_of`). text_features: vectors of the objects' names; by default, the
     scene's own words and text encoder.
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
     near = near_plane(scene.cloud.xyz, cameras)  # one for all frames, as in the fit
-    # Each object by itself, as the protocol asks for them: other objects' names are no rivals.
+    # Each object is queried by itself, as in the protocol: other objects' names do not compete.
     selected = {name: select(scene, name, against=[], text_features=text_features) for name in labels.objects}
     best = {name: () if one.best is None else (one.best.instance,) for name, one in selected.items()}
     chosen = {"best": best, "calibrated": {name: one.instances for name, one in selected.items()}}
@@ -220,6 +219,6 @@ def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float
 def _alpha(
     gaussians: Gaussians, ids: NDArray[np.int32], camera: Camera, near: float, instances: Sequence[int]
 ) -> NDArray[np.float32]:
-    """(H, W) alpha of a view of some instances' points alone, with nothing before them."""
+    """(H, W) alpha of a view of some instances' points alone, with nothing in front."""
     alone = gaussians.take(np.flatnonzero(np.isin(ids, instances)))
     return render(alone, np.zeros((len(alone), 0), np.float32), camera, near)[1]

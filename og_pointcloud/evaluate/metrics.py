@@ -12,10 +12,10 @@ from og_pointcloud.errors import OgPointcloudError
 
 @dataclass(frozen=True)
 class Score:
-    """One labelling, scored. All shares in [0, 1]; NaN where nothing was there to be scored.
+    """Scores of one labelling. All shares are in [0, 1]; NaN where there was nothing to score.
 
     miou, macc: mean IoU and mean recall over ``classes``. unknown_share: of the scored points, those labelled -1.
-    background_called: of the true background, the share that was given a class; None where no background is known.
+    background_called: share of the true background that was given a class; None where no background is known.
     points: points scored. classes: ids with enough points. class_iou, class_accuracy: per entry of ``classes``.
     """
 
@@ -35,11 +35,11 @@ def score_labels(
 ) -> Score:  # fmt: skip
     """Mean IoU and recall over the classes of the truth.
 
-    labels, truth: (n,) class ids, -1 unknown; ids of both mean the same. background: (n,) bool, points known to be of
+    labels, truth: (n,) class ids, -1 unknown; the same ids in both. background: (n,) bool, points known to be of
     no class: a class called there is a false positive of that class. scored: (n,) bool, labelled points that count
-    (default: all). Classes with fewer than ``min_points`` such points are left out, their points with them.
+    (default: all). Classes with fewer than ``min_points`` such points are left out, and so are their points.
 
-    Raises OgPointcloudError where the arrays do not have one length.
+    Raises OgPointcloudError where the arrays differ in length.
 
     >>> score_labels(np.array([0, 0, 1, -1]), np.array([0, 0, 1, 1]), min_points=1).class_iou
     (1.0, 0.5)
@@ -53,7 +53,7 @@ def score_labels(
     ids, counts = np.unique(truth[evaluated], return_counts=True)
     classes = ids[counts >= min_points]
     evaluated &= np.isin(truth, classes)
-    # A class called on background is in its union, and a false alarm; recall is over the class's own points.
+    # A class called on background counts in its union, as a false alarm; recall is over the class's own points.
     counted = evaluated if background is None else evaluated | background
     ious, accuracies = [], []
     for class_id in classes:
@@ -77,7 +77,7 @@ def score_labels(
 def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer]) -> float:
     """Agreement of two partitions of the same points, 1 for equal, about 0 for unrelated ones (Hubert & Arabie 1985).
 
-    first, second: (n,) ids of any value; every id, negative ones too, is a part. NaN for n = 0.
+    first, second: (n,) ids of any value; every id, including negative ones, is a part. NaN for n = 0.
     """
     first, second = np.asarray(first), np.asarray(second)
     if first.shape != second.shape:
@@ -97,7 +97,7 @@ def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer])
 
 
 def _pairs(counts: NDArray[np.integer]) -> float:
-    """Pairs of points that share a part, from the parts' sizes; in float64, as their products may overflow int64."""
+    """Number of pairs of points in the same part, from the parts' sizes; float64, as products may overflow int64."""
     sizes = counts.astype(np.float64)
     return float((sizes * (sizes - 1) / 2).sum())
 

@@ -1,7 +1,7 @@
-"""ScanNet point segmentation as OpenGaussian's table has it: NYU40 classes of ``*_vh_clean_2.labels.ply``.
+"""ScanNet point segmentation as in OpenGaussian's table: NYU40 classes of ``*_vh_clean_2.labels.ply``.
 
-Rules. A task is 19, 15 or 10 classes, asked by their bare names. Points of other classes, and points whose Gaussian has
-an opacity below 0.1, are ignored: neither they nor what is predicted on them counts anywhere. IoU and recall are taken
+Rules. A task is 19, 15 or 10 classes, queried by their bare names. Points of other classes, and points whose Gaussian
+has an opacity below 0.1, are ignored: neither they nor predictions on them count anywhere. IoU and recall are computed
 per class over one scene and averaged over the classes *present in that scene*, then over scenes (macro mean).
 """
 
@@ -35,7 +35,7 @@ TASKS: Mapping[int, tuple[int, ...]] = {
 SCENES = tuple(f"scene{number:04}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645))
 """The ten scenes of the table."""
 MIN_OPACITY = 0.1
-"""Points of fainter Gaussians are ignored, see above."""
+"""Points of fainter Gaussians are ignored (see above)."""
 MAX_NYU40_ID = 40
 
 
@@ -57,9 +57,9 @@ def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]
 def ask(
     file: Path, xyz: NDArray[np.float64], task: int, text_features: Path | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(n,) NYU40 ids that a .ogpc file gives a scene's vertices, 0 unknown; and those where every instance with a
+    """(n,) NYU40 ids that a .ogpc file gives a scene's vertices, 0 unknown; and the ids if every instance with a
     feature takes its best class, however badly it fits. xyz: (n, 3) world coordinates. task: 19, 15 or 10."""
-    scene, ids = as_scene(file), np.array([*TASKS[task], 0])  # the last is what label -1 takes: unknown
+    scene, ids = as_scene(file), np.array([*TASKS[task], 0])  # label -1 takes the last: unknown
     names = [NAMES[class_id] for class_id in TASKS[task]]
     words = scene.words(names, text_features)
     result = segment(xyz, words, scene=scene)
@@ -70,7 +70,7 @@ def ask(
 def score_scene(
     predicted: NDArray[np.integer], truth: NDArray[np.integer], task: int, opacity: NDArray[np.floating] | None = None
 ) -> Score:
-    """Score one scene; its class ids are NYU40's. NaN where no point is of the task.
+    """Score one scene; class ids are NYU40's. NaN where no point belongs to the task.
 
     predicted: (n,) NYU40 ids, below 1 for unknown; an id outside the task is a wrong answer. truth: (n,) NYU40 ids.
     task: 19, 15 or 10. opacity: (n,) of each point's Gaussian; None counts all points.

@@ -1,7 +1,7 @@
 """Error against run time: settings x captures -> one table, with error and seconds in the same row.
 
-Each mode first fits a few points, and the result is discarded: compiled code is loaded before seconds count. Beside the
-settings stand other methods on the default's mask table (`baselines`).
+Each mode first fits a few points and discards the result, so that no seconds include loading compiled code. Other
+methods on the default's mask table (`baselines`) are listed beside the settings.
 
     with gt.npz and text_features.npz      error = 1 - mIoU; a point without a label is a miss, a class called on known
                                            background a false alarm
@@ -42,7 +42,7 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 
 BASELINE = "baseline"
-"""The knob of rows of other methods."""
+"""The knob named in rows of other methods."""
 WARM_UP_POINTS = 2_000
 
 Labels = NDArray[np.integer]
@@ -50,7 +50,7 @@ Labels = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Subject:
-    """A capture, the words that are asked of it, and what its points are. Both None where the folder lacks either."""
+    """A capture, the words to query, and the truth of its points. Both are None where the folder lacks either."""
 
     name: str
     scene: Scene
@@ -62,12 +62,12 @@ class Subject:
 class Row:
     """One setting on one capture.
 
-    seconds: of a whole fit. error: 1 - mIoU, or where the truth is not known 1 - reliability.
-    miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
-    class. None without truth.
-    gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
+    seconds: of a whole fit. error: 1 - mIoU, or 1 - reliability without truth.
+    miou, macc, unknown: over the points with a known class; background: share of known background that was given a
+    class. All None without truth.
+    gain, gain_low, gain_high: mIoU minus the default's, with its paired 95 % interval over blocks of space.
     reliability: of the fit (`LabelledCloud.reliability`), None for other methods.
-    left_out: what the fit left out and why, as its provenance has it.
+    left_out: what the fit left out and why, from its provenance.
     """
 
     capture: str
@@ -93,13 +93,13 @@ class Row:
 
     @property
     def is_default(self) -> bool:
-        """Whether this is what a fit without settings does."""
+        """Whether this is a fit without settings."""
         return self.knob == DEFAULT.knob
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """rows: of every capture in turn, the default first. failed: what could not be run -> why."""
+    """rows: capture by capture, the default first. failed: what could not be run -> why."""
 
     rows: tuple[Row, ...]
     failed: dict[str, str]
@@ -111,10 +111,10 @@ class Sweep:
 
 
 def read_subject(folder: Path) -> Subject:
-    """A capture with its words and its truth, as far as it has them.
+    """A capture with its words and its truth, where it has them.
 
-    Raises SceneError where the truth is of another cloud, FeatureSpaceError where the words are of another encoder than
-    the masks.
+    Raises SceneError where the truth belongs to another cloud, FeatureSpaceError where words and masks come from
+    different encoders.
     """
     folder = folder.absolute()  # "." has no name
     scene, words = read_capture(folder), folder / "text_features.npz"
@@ -134,8 +134,8 @@ def read_subject(folder: Path) -> Subject:
 def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, progress: bool = True) -> Sweep:
     """Try all settings on all captures. settings: the default (knobs.DEFAULT) first.
 
-    A setting that fails is named in the result and costs no other. Deterministic but for seconds. OgPointcloudError
-    where not even the default could be run on any capture.
+    A setting that fails is named in the result; the others still run. Deterministic except for seconds.
+    OgPointcloudError where not even the default could be run on any capture.
     """
     from tqdm import tqdm
 
@@ -149,15 +149,15 @@ def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, progress:
                     bar.set_postfix_str(f"{subject.name}, {setting.name}")
                     try:
                         rows.append(trial.row(setting))
-                    except Exception as error:  # one setting must not cost the report, which names it
-                        if setting == DEFAULT:  # what all others are compared with
+                    except Exception as error:  # one failing setting must not cost the report, which names it
+                        if setting == DEFAULT:  # all others are compared with it
                             raise
                         failed[f"{subject.name}, {setting.name}"] = f"{type(error).__name__}: {error}"
                     bar.update()
                 rows += trial.baselines()
             except OgPointcloudError as error:
                 failed[subject.name] = str(error)
-            bar.update((number + 1) * len(settings) - bar.n)  # past what a capture that failed did not try
+            bar.update((number + 1) * len(settings) - bar.n)  # skip what a failed capture did not try
     if not rows:
         raise OgPointcloudError(f"no capture could be fitted: {next(iter(failed.values()), 'none was given')}")
     return Sweep(tuple(rows), failed)
@@ -196,7 +196,7 @@ class _Trial:
         )  # fmt: skip
 
     def baselines(self) -> Iterator[Row]:
-        """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
+        """Other methods, unrestricted and without points that lie mostly outside masks; none without truth."""
         if self.subject.vocabulary is None or self.default is None:
             return
         start = time.perf_counter()
@@ -207,8 +207,8 @@ class _Trial:
             yield Row(self.subject.name, BASELINE, name, preparing + seconds, 1 - scores["miou"], **scores)
 
     def _scores(self, labels: Labels, spacing: float) -> dict[str, Any]:
-        """Fields of `Row` for labels that index the subject's words, -1 unknown. The first call is the default's, with
-        which later ones are compared."""
+        """Fields of `Row` for labels that index the subject's words, -1 unknown. The first call is for the default,
+        with which later ones are compared."""
         truth, words = self.subject.truth, self.subject.vocabulary
         assert truth is not None
         assert words is not None
@@ -224,10 +224,10 @@ class _Trial:
 
 
 def warm_up(scene: Scene, settings: FitSettings | None = None) -> None:
-    """Fit two views of a few points, so that no seconds hold the loading of compiled code."""
+    """Fit two views of a few points, so that no measured seconds include loading compiled code."""
     points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
     views = tuple(view for view in scene.views if view.mask_count)[:2]
-    with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
+    with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will report
         fit(replace(scene, points=points, views=views), settings, progress=False)
 
 
@@ -241,7 +241,7 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 
 def write_rows(rows: Iterable[Row], path: Path) -> Path:
-    """A CSV with a line a row, the machine and the versions in each; written whole or not at all."""
+    """A CSV with a line per row, each with the machine and the versions; written whole or not at all."""
     where, records = machine(), []
     for row in rows:
         left_out = "; ".join(str(entry["what"]) for entry in row.left_out)
@@ -250,7 +250,7 @@ def write_rows(rows: Iterable[Row], path: Path) -> Path:
 
 
 def machine() -> str:
-    """Where seconds were measured: processor, cores, system, and the versions of Python and the libraries."""
+    """The machine that measured seconds: processor, cores, system, and the versions of Python and the libraries."""
     information = Path("/proc/cpuinfo")
     models = re.findall(r"^model name\s*: (.*)", information.read_text(), re.M) if information.is_file() else []
     processor = models[0] if models else platform.processor() or platform.machine()

@@ -1,4 +1,4 @@
-"""A sweep to look at: a chart of error against seconds, and the tables as Markdown, with what was left out."""
+"""Report of a sweep: a chart of error against seconds, and the tables as Markdown, with what was left out."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ SHARES = {
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""
 COLORS, MARKERS = [f"C{number}" for number in range(10)], "osD^vPX*<>hpd"
-"""Together they tell 130 knobs apart: their numbers have no divisor in common."""
+"""Together they tell 130 knobs apart: their counts have no common divisor."""
 WIDTH, PANEL_HEIGHT = 11.0, 5.2
 LINEAR_BELOW = 0.01
-"""Errors are on a logarithmic axis down to this one, and linear from there to 0."""
+"""The error axis is logarithmic down to this error, and linear from there to 0."""
 TICKS = (0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 FRONT_MARK = " *"
-"""Behind the settings of the front, in tables."""
+"""Follows the settings of the front in tables."""
 
 
 def require_matplotlib() -> Any:
@@ -35,7 +35,7 @@ def require_matplotlib() -> Any:
 
 
 def write_chart(sweep: Sweep, path: Path) -> Path:
-    """A PNG, a panel a capture: error against seconds, both of every row; the default ringed, the front joined.
+    """A PNG with one panel per capture: error against seconds of every row; the default is ringed, the front joined.
     Written whole or not at all."""
     captures = sweep.captures
     figure = require_matplotlib()(figsize=(WIDTH, PANEL_HEIGHT * len(captures)), layout="constrained")
@@ -106,7 +106,7 @@ def _markdown(cells: Sequence[str]) -> str:
 
 
 def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
-    """A header, then the cells of each row; without the columns that no row has a figure for."""
+    """A header, then the cells of each row, without columns that are empty in all rows."""
     header = ("setting", "seconds", "error", "mIoU less the default's (95 %)", *SHARES, "instances")
     best = {id(row) for row in front(rows)}
     lines = [_cells(row, FRONT_MARK if id(row) in best else "") for row in rows]

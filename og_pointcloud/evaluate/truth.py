@@ -1,4 +1,4 @@
-"""A capture's own ground truth: ``gt.npz`` beside its cloud. It is read for scores alone, never by a fit."""
+"""A capture's own ground truth: ``gt.npz`` beside its cloud. Only scores read it, never a fit."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from og_pointcloud.formats.npy import read_npz
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
 POINT_ARRAYS = ("background", "views", "ratio", "votes", "instance")
-"""Optional arrays of gt.npz, one value a point."""
+"""Optional arrays of gt.npz, one value per point."""
 MIN_VOTE_SHARE, MIN_VOTES = 0.5, 2
-"""Least share of the votes that must agree on a class, and fewest votes, where classes were found by votes."""
+"""Where classes were found by votes: smallest share of votes that must agree on a class, and smallest number."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """cls: (n,) int, row of ``names`` that each point is, -1 none. scored: (n,) bool, whether its truth can be relied
-    on. background: (n,) bool, known to be of no class; None where that is not known. instance: (n,) int, the thing that
-    a point is part of, below 0 none; None where that is not known."""
+    """cls: (n,) int, class of each point, an index into ``names``, -1 none. scored: (n,) bool, whether its truth is
+    reliable. background: (n,) bool, known to be of no class; None if unknown. instance: (n,) int, the thing that a
+    point is part of, below 0 none; None if unknown."""
 
     cls: NDArray[np.integer]
     names: tuple[str, ...]
@@ -46,17 +46,17 @@ class Truth:
         return number[np.maximum(labels, -1)]
 
     def score(self, called: NDArray[np.integer]) -> Score:
-        """The score of classes (n,) that points are called, as `class_of` gives them; SceneError for another length."""
+        """The score of the classes (n,) given to points, as `class_of` returns them; SceneError for another length."""
         if len(called) != len(self.cls):
             raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(called)}; expected one each")
         return score_labels(called, self.cls, scored=self.scored, background=self.background)
 
 
 def read_truth(folder: str | os.PathLike[str]) -> Truth:
-    """A capture's ``gt.npz``: ``cls`` (n,), ``names``, and where known ``instance``, ``background``, ``views``,
+    """A capture's ``gt.npz``: ``cls`` (n,), ``names``, and optionally ``instance``, ``background``, ``views``,
     ``ratio``, ``votes``.
 
-    Points that no view shows (views 0), or whose class less than half of the votes, or a single one, agree on, are not
+    Points that no view shows (views 0), or whose class has less than half of the votes or only a single one, are not
     scored. Raises SceneError where the file is absent, damaged, or lacks what is needed.
     """
     path = Path(folder) / GT_NAME
@@ -79,7 +79,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
     if instance is not None and instance.dtype.kind not in "iu":
         raise SceneError(f"{path}: instance is {instance.dtype}; expected whole numbers, below 0 for none")
     scored = np.ones(len(cls), bool)
-    # A file may say how each point got its class: by votes of labelled images, which may be few or divided.
+    # A file may state how each point got its class: by votes of labelled images, which may be few or divided.
     if "views" in entries:
         scored &= entries["views"] > 0
     if "ratio" in entries and "votes" in entries:

@@ -17,13 +17,13 @@ from og_pointcloud.errors import OgPointcloudError
 
 try:
     import fcntl
-except ImportError:  # on Windows: there a second process is not kept out
+except ImportError:  # on Windows, where a second process is not kept out
     fcntl = None
 
 StrPath: TypeAlias = "str | os.PathLike[str]"
 """A path as callers give it."""
 LOCK = ".lock"
-"""The file in a folder that tells processes that another works there."""
+"""The file in a folder that shows other processes that one works there."""
 STALE_S = 60.0
 """A younger temporary file is left alone: its maker may not have locked it yet."""
 
@@ -33,9 +33,9 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A file to write that replaces ``path`` when, and only when, the block ends without an error.
 
     Several processes may write one path at a time: each file is whole, and the last one stays. Missing parent folders
-    are made; temporary files that killed runs left for the same path are removed.
+    are created; temporary files that killed runs left for the same path are removed.
     durable: the file is on the disk before it replaces the path, so that not even a power cut leaves half of one; False
-    for files whose readers check them. OSError names the path even where writing fails (a full disk). OgPointcloudError
+    for files whose readers check them. OSError names the path even if writing fails (a full disk). OgPointcloudError
     where the path is a folder, or a device, which would be destroyed.
     """
     path = Path(path)
@@ -60,7 +60,7 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
             raise OSError(error.errno, f"{error.strerror}, it was not written", str(path)) from error
         raise
     finally:
-        temporary.unlink(missing_ok=True)  # where it has not replaced the path
+        temporary.unlink(missing_ok=True)  # if it has not replaced the path
 
 
 def write_file(path: StrPath, data: bytes) -> Path:
@@ -78,7 +78,7 @@ def write_json(path: StrPath, value: Mapping[str, Any]) -> Path:
 
 @contextmanager
 def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
-    """The path of a folder to make and fill, which becomes ``path`` when, and only when, the block ends without an
+    """The path of a folder to create and fill, which becomes ``path`` when, and only when, the block ends without an
     error. overwrite: it may replace an existing folder; else there must be none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -106,9 +106,9 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make the folder and keep other processes out of it; OgPointcloudError where another is in it already.
+    """Create the folder and keep other processes out of it; OgPointcloudError if another one already works there.
 
-    A process's lock ends with it, however it ends. A folder that is empty afterwards stays.
+    The lock ends with the process, however that ends. A folder that is empty afterwards stays.
     """
     file = _lock_file(folder)
     try:
@@ -138,7 +138,7 @@ def _lock_file(folder: Path) -> IO[str]:
                 "another folder"
             )
         # A run that has just ended may have removed the file between our opening and locking it: then our lock keeps
-        # nobody out, and the next iteration makes a new one.
+        # nobody out, and the next iteration creates a new one.
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), (folder / LOCK).stat()):
                 file.truncate(0)
@@ -165,7 +165,7 @@ def _temporary(path: Path) -> Path:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove temporary files of this path that nobody writes any more."""
+    """Remove temporary files of this path that no process is still writing."""
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         with suppress(OSError):
             if not old.is_symlink() and old.is_file() and time.time() - old.stat().st_mtime > STALE_S:
@@ -175,7 +175,7 @@ def _remove_stale(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put a folder's new entries on the disk, where the system can."""
+    """Flush a folder's new entries to the disk, where the system can."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""A capture folder becomes a Scene: poses, masks with features, geometry, and images where there are any.
+"""Read a capture folder as a Scene: poses, masks with features, geometry, and images if present.
 
 Each part comes from the first of these that the folder has.
   poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0`` (of
@@ -8,13 +8,13 @@ Each part comes from the first of these that the folder has.
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
             ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``;
             KITTI-360's static cloud; COLMAP's ``points3D``, with COLMAP's poses; depth images, fused
-  depth     optional; ``depth_file_path`` of a frame; where the data set has it; ``depth/`` beside ``images/``
-  images    optional; where the pose file says, or of that name in ``images/``
+  depth     optional; ``depth_file_path`` of a frame; the data set's location; ``depth/`` beside ``images/``
+  images    optional; the path in the pose file, or that file name in ``images/``
 
-A view is called by its image's file stem, and so are its masks and features; where two images share a stem (rigs demand
-it), by the path below the folder that all images share: ``left/000``, ``masks/left/000.png``.
+A view is named by its image's file stem, and so are its masks and features; where two images share a stem (as in rigs),
+by the path below the folder that all images share: ``left/000``, ``masks/left/000.png``.
 
-An image whose lens no pinhole can show (fisheye, equirectangular) becomes the faces of a cube, and a view each:
+An image whose lens no pinhole can show (fisheye, equirectangular) becomes the faces of a cube, one view each:
 ``frame/front``, ``frame/left``. Masks belong to the image as it is, ``masks/frame.png``, and are split with it, or to
 the faces, ``masks/frame/front.png``.
 
@@ -66,13 +66,13 @@ CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
 DECODED_MAPS = 4
 """Decoded mask maps kept for images with several faces, which are read one after the other."""
 MAX_FUSED_FRAMES = 300
-"""Depth images that are fused at most, spread evenly: neighbors in a recording show almost the same."""
+"""At most this many depth images are fused, spread evenly: neighbors in a recording show almost the same."""
 
 
 @dataclass(frozen=True)
 class CapturePoses:
     """The posed pinhole images of a capture. names: of their views. source: the pose file or folder. is_recording: the
-    frames are those of a video, of which perhaps only some have masks."""
+    frames come from a video, and perhaps only some have masks."""
 
     names: tuple[str, ...]
     images: tuple[PosedImage, ...]
@@ -96,7 +96,7 @@ def read_capture(
         folder's ``repairs.json``, which `og-pointcloud repair` writes.
 
     Masks and images are read later, on demand; poses, features and points are read here, and file headers are checked.
-    Raises SceneError with the cause and the cure; warns of images that are listed but absent and of frames without a
+    Raises SceneError with the cause and the cure; warns of images that are listed but absent, and of frames without a
     pose, which are left out.
 
     >>> import og_pointcloud as og
@@ -204,7 +204,7 @@ def _size_of_image(capture: Path, path: str) -> tuple[int, int]:
 
 
 def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
-    """File stems; where two images share one (rigs demand it), paths from the folder that all images share."""
+    """File stems; where two images share one (as in rigs), paths from the folder that all images share."""
     paths = [posixpath.normpath(without_suffix(image.path)) for image in images]
     stems = [posixpath.basename(path) for path in paths]
     # Two images with the same path cannot be told apart by any name: the scene refuses such stems.
@@ -250,7 +250,7 @@ def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list
     distinct = list(dict.fromkeys(called))
     read, feature_space = _read_masks(capture, distinct, level)
     stored = dict(zip(distinct, read, strict=True))
-    # Faces of one image share its decoded map.
+    # Faces of one image share its decoded mask map.
     latest = lru_cache(maxsize=DECODED_MAPS)(lambda name: stored[name].read())
     # Masks of a whole image are cut to the view; a cube face's own masks have its pixels already.
     return [
@@ -268,8 +268,8 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     size = scaled.camera.width, scaled.camera.height
     if not face.name:  # the one view of an image shows all of its masks
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
-    # Which masks a face shows decides its features: the map is read now, and kept as runs of equal ids. These are
-    # smaller than the features of most masks, and the whole image is not read again for each of its faces.
+    # The features of a face depend on the masks that it shows: the map is read now, and kept as runs of equal ids.
+    # These are smaller than the features of most masks, and the whole image is not read again for each of its faces.
     ids = scaled.mask_ids(layer.read())
     flat, shape = ids.ravel(), ids.shape
     first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
@@ -323,7 +323,7 @@ def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | No
                 "in depth/: add one of them, or name a file (--gaussians)"
             )
         return _fused(capture, frames).points
-    if poses.source != model:  # tools rotate, shift or scale COLMAP's world, and seldom say how
+    if poses.source != model:  # tools rotate, shift or scale COLMAP's world, and seldom state how
         raise SceneError(
             f"{poses.source} names no cloud, and the world of {model}/points3D may be another than that of its poses; "
             f"expected a cloud in the world of {poses.source.name}: add {CLOUD_NAMES[0]}, or remove "
@@ -356,7 +356,7 @@ def _find_cloud(capture: Path) -> Path | None:
 def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCloud:
     """The cloud of a capture's depth images, whether or not the folder has another; warns of what is doubtful.
 
-    depth_unit: world lengths of a stored step, where the files do not say. Raises SceneError where there are none.
+    depth_unit: world lengths per stored step, if the files do not state it. Raises SceneError without depth images.
     """
     capture = Path(folder)
     frames = _depth_frames(capture, read_poses(capture))
@@ -374,7 +374,7 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
         if image.depth is not None:
             files[name] = image.depth
         elif path := find_depth(capture, name):
-            # Depth beside a distorted photograph is distorted alike; faces of a cube have depth images of their own.
+            # Depth beside a distorted photograph has the same distortion; cube faces have depth images of their own.
             whole = image.face if image.face is not None and not image.face.name else None
             files[name] = DepthFile(path, whole.whole, lens=whole.lens) if whole else DepthFile(path, image.camera)
     return files
@@ -393,7 +393,7 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 
 
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
-    from og_pointcloud.formats.fusion import doubtful_depth, fuse  # loads numba, which captures with a cloud do without
+    from og_pointcloud.formats.fusion import doubtful_depth, fuse  # loads numba, not needed with a cloud
 
     fused = fuse(frames)
     empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None
@@ -411,7 +411,7 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
 
 
 def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
-    """Where the posed images are, None for one that is not found; warns of those."""
+    """The files of the posed images, None where one is not found; warns of those."""
     file_of = {path: find_image(capture, path) for path in {image.path for image in images}}  # faces share an image
     files = [file_of[image.path] for image in images]
     missing = [image.path for image, file in zip(images, files, strict=True) if file is None]

@@ -1,9 +1,9 @@
 """COLMAP sparse models, .bin and .txt: world-to-camera poses, OpenCV axes, pixel centers at +0.5 as in the scene.
 
 Layout: https://colmap.github.io/format.html. Binary files are little endian: a count (uint64), then the records. Text
-files have a record a line, ``#`` for comments. Where both are present the binary files are read, as COLMAP does.
+files have one record per line, ``#`` for comments. If both are present, the binary files are read, as in COLMAP.
 
-Since 3.12 a model may have files of rigs and frames. They need not be read: the images file still has all poses.
+Since 3.12 a model may have rigs and frames files. They are not needed: the images file still has all poses.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CAMERA_MODELS: dict[str, tuple[int, str]] = {
     "EUCM": (16, "fx fy cx cy alpha beta"),
     "EQUIRECTANGULAR": (17, "w h"),
 }
-"""COLMAP's ids and parameters. RAD_TAN_THIN_PRISM_FISHEYE (11) alone is refused."""
+"""COLMAP's ids and parameters. Only RAD_TAN_THIN_PRISM_FISHEYE (11) is refused."""
 LENS_MODELS = {"FOV": "fov", "DIVISION": "division", "SIMPLE_DIVISION": "division", "EUCM": "extended"}
 MODEL_NAMES = {model_id: name for name, (model_id, _) in CAMERA_MODELS.items()}
 
@@ -126,7 +126,7 @@ def _camera(
     """A function from a pose (world to camera) to the camera, and the lens. values: by parameter name."""
     if camera_model == "EQUIRECTANGULAR":
         return partial(spherical_camera, *size), SPHERICAL
-    # What is left of the values after focal lengths and principal point are the terms of the lens.
+    # The values other than focal lengths and principal point are the terms of the lens.
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
     model = "fisheye" if camera_model.endswith("FISHEYE") else LENS_MODELS.get(camera_model, "perspective")
@@ -141,7 +141,7 @@ def _cameras_text(file: Path) -> Iterator[CameraRecord]:
         words = [*line.split(), *[""] * 4]  # "" for missing fields, which then fail as numbers
         (camera_id,), camera_model, size = _numbers(int, words[:1], place), words[1], _numbers(int, words[2:4], place)
         names = _parameters(file, camera_id, camera_model)
-        if len(line.split()) > 4 + len(names):  # as where the model's name is wrong
+        if len(line.split()) > 4 + len(names):  # for example if the model's name is wrong
             raise SceneError(
                 f"{place}: a {camera_model} with more than {len(names)} parameters; expected {', '.join(names)}: name "
                 "the model that they are of"
@@ -151,7 +151,7 @@ def _cameras_text(file: Path) -> Iterator[CameraRecord]:
 
 
 def _images_text(file: Path) -> Iterator[ImageRecord]:
-    """Two lines each. The second lists 2-D points; it is empty, but there, where an image has none."""
+    """Two lines each. The second lists 2-D points; it is present but empty if an image has none."""
     for place, line, lines in _lines(file):
         words = [*line.split(None, 9), *[""] * 10]
         if not words[9].strip():
@@ -168,7 +168,7 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
 
 def _lines(file: Path) -> Iterator[tuple[str, str, Iterator[tuple[int, str]]]]:
     """Lines that are not comments: each line's place, for errors, its text, and the numbered lines after it."""
-    with file.open(encoding="utf-8-sig", errors="replace") as stream:  # editors on Windows put a mark before the text
+    with file.open(encoding="utf-8-sig", errors="replace") as stream:  # editors on Windows write a byte order mark
         lines = enumerate(stream, 1)
         for number, line in lines:
             if line.strip() and not line.startswith("#"):
@@ -203,7 +203,7 @@ def _images_binary(file: Path) -> Iterator[ImageRecord]:
     for _ in range(source.count(4 + 7 * 8 + 4 + 1 + 8)):  # id, pose, camera, an empty name, number of 2-D points
         _, *pose, camera_id = source.unpack("<I7dI")
         yield tuple(pose), camera_id, source.name()
-        points = source.count(24)  # 2-D points: thousands an image, which nothing here needs
+        points = source.count(24)  # 2-D points: thousands per image, not needed here
         source.offset += 24 * points
 
 
@@ -217,7 +217,7 @@ class _Binary:
             self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
 
     def count(self, minimum_bytes: int) -> int:
-        """A number of records, checked against the bytes that are left before memory is taken for them."""
+        """A number of records, checked against the remaining bytes before memory is allocated for them."""
         count = self.unpack("<Q")[0]
         self.require(count * minimum_bytes)
         return count
@@ -253,7 +253,7 @@ TRACK_ELEMENT_BYTES = 8
 
 
 def _points_binary(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
-    """Records of unequal length, as each ends in its track: a loop finds where they start, numpy reads the rest."""
+    """Records differ in length, as each ends with its track: a loop finds where they start, numpy reads the rest."""
     source = _Binary(path)
     data, offsets = source.data, np.empty(source.count(POINT.itemsize), np.int64)
     last_start = len(data) - POINT.itemsize
@@ -264,14 +264,14 @@ def _points_binary(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
         offsets[row] = source.offset
         source.offset += POINT.itemsize + TRACK_ELEMENT_BYTES * track_length(data, source.offset + TRACK_LENGTH_AT)[0]
     source.require(0)
-    # A record may start at any byte: view the file as one record per byte, and take those that are real.
+    # A record may start at any byte: view the file as one record per byte, and pick the real ones.
     at_every_byte = np.ndarray(max(last_start + 1, 0), POINT, data, strides=(1,))
     points = at_every_byte[offsets]
     return points["xyz"].astype(np.float64), points["rgb"].copy()
 
 
 def _points_text(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
-    """One line a point: id, x, y, z, r, g, b, error, track."""
+    """One line per point: id, x, y, z, r, g, b, error, track."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
@@ -280,5 +280,5 @@ def _points_text(path: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
         raise SceneError(
             f"{path}: {error!s:.120}; expected lines of id x y z r g b and more: export it again"
         ) from None
-    with np.errstate(invalid="ignore"):  # a color that is no number is black
+    with np.errstate(invalid="ignore"):  # a color that is not a number is black
         return values[:, :3].copy(), np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)

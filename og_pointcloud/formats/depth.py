@@ -1,8 +1,8 @@
 """Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
 
-16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are millimeters in a world of meters unless the
-data set says otherwise, stored floats are lengths of the world. The largest number of 16 bits, 65535, is what sensors
-write for "no reading" or "too far", and no depth, like 0.
+16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored integers are millimeters in a world of meters unless the data
+set states otherwise; stored floats are world lengths. The largest 16-bit number, 65535, is not a depth, like 0: sensors
+write it for "no reading" or "too far".
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MILLIMETER = 1e-3
 @dataclass(frozen=True)
 class DepthImage:
     """depth: (H, W) float32, in lengths of the world along the optical axis, 0 unmeasured. camera: its own, of that
-    size, its pose from world coordinates."""
+    size, with its pose from world coordinates."""
 
     depth: NDArray[np.float32]
     camera: Camera
@@ -37,10 +37,10 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class DepthFile:
-    """A depth image that is read on demand.
+    """A depth image, read on demand.
 
-    camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths of a
-    stored step, None for the rule by type (`lengths`).
+    camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths per
+    stored step; None: depends on the type (`lengths`).
     """
 
     path: Path
@@ -49,7 +49,7 @@ class DepthFile:
     lens: Lens | None = None
 
     def read(self) -> DepthImage:
-        """Decode, scale and undistort; of a lens that no pinhole can show, only what lies in front.
+        """Decode, scale and undistort; for a lens that no pinhole can show, only the front face.
 
         SceneError names the file, what it holds and what was expected.
         """
@@ -77,11 +77,11 @@ class DepthFrame:
 
 
 def lengths(stored: NDArray, unit: float | None = None) -> NDArray[np.float32]:
-    """(H, W) float32 world lengths of stored depths, 0 where nothing was measured: 0, negative numbers, NaN, infinity,
-    and of uint16 also its largest number. unit: world lengths of a stored step; None: 1/1000 of whole numbers, which
-    are millimeters of a world in meters, and 1 of floats."""
+    """(H, W) float32 world lengths of stored depths, 0 where nothing was measured: at 0, negative numbers, NaN,
+    infinity, and the largest uint16. unit: world lengths per stored step; None: 1/1000 for integers, which are
+    millimeters in a world of meters, and 1 for floats."""
     whole = stored.dtype.kind in "iu"
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN and what overflows are not measured
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN and overflows count as unmeasured
         depth = stored.astype(np.float32) * np.float32((MILLIMETER if whole else 1.0) if unit is None else unit)
         measured = np.isfinite(depth) & (depth > 0)
     if stored.dtype == np.uint16:
@@ -96,14 +96,14 @@ def find_depth(capture: Path, name: str) -> Path | None:
 
 
 def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
-    """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 where it does not look.
+    """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 outside its view.
 
-    Between two pinholes with one center and one orientation, a column depends on the column alone and a row on the row
-    alone, so whole lines are picked; by nearest pixel, as depths must not be blended over an edge.
+    Between two pinholes with one center and one orientation, columns depend only on columns and rows only on rows,
+    so whole lines are picked; by nearest pixel, as depths must not be blended across an edge.
     """
     columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
     rows = _positions(target.height, target.fy, target.cy, source.fy, source.cy)
-    # Lines beyond the source's border are picked from the border, and then set to 0.
+    # Lines beyond the source's border are taken from the border, then set to 0.
     seen = (columns >= 0) & (columns < source.width), (rows >= 0) & (rows < source.height)
     picked = values[np.ix_(np.clip(rows, 0, source.height - 1), np.clip(columns, 0, source.width - 1))]
     picked[:, ~seen[0]] = 0
@@ -112,13 +112,13 @@ def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
 
 
 def _positions(count: int, focal: float, center: float, source_focal: float, source_center: float) -> NDArray[np.intp]:
-    """(count,) the source's pixel, along one axis, at each of the target's pixels; outside of the image too."""
+    """(count,) the source's pixel, along one axis, at each of the target's pixels; it may lie outside the image."""
     along = (np.arange(count) + 0.5 - center) / focal
     return np.floor(along * source_focal + source_center).astype(np.intp)
 
 
 def _stored(file: Path) -> NDArray:
-    """(H, W) numbers as the file holds them."""
+    """(H, W) numbers as stored in the file."""
     suffix = file.suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         raise SceneError(f"{file} ends in '{suffix}'; expected a depth image: {', '.join(DEPTH_SUFFIXES)}")

@@ -1,9 +1,9 @@
 """E57 files (ASTM E2807) of laser scanners: their scans as one cloud, their images as a capture folder.
 
 Poses take scans and images to the file's world. A pinhole image looks along -z, y up; a spherical one along +x, z up,
-and may end before the poles: it is filled up with black. Images without a pose, cylindrical ones, and those that only
-show the place (visual references) cannot be used. Read by pye57's libE57 (MIT, BSL), the extra 'e57', which checks the
-file's checksums.
+and may end before the poles: it is padded with black. Images without a pose, cylindrical ones, and those that only
+illustrate the site (visual references) cannot be used. Read by pye57's libE57 (MIT, BSL), the extra 'e57', which checks
+the file's checksums.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ INVALID_STATES = ("cartesianInvalidState", "sphericalInvalidState")
 POINTS_PER_CHUNK = 1 << 18
 """Points read at once."""
 MAX_POINTS_PER_BYTE = 8
-"""No scanner's file packs more; one that claims to is made to fill memory."""
+"""No scanner's file packs more; one that claims to is an attempt to fill memory."""
 TURN_TOLERANCE = 0.02
-"""A spherical image must span 360 degrees to within this share."""
+"""A spherical image must span 360 degrees, within this relative tolerance."""
 SPHERICAL_FROM_OPENGL = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
@@ -64,7 +64,7 @@ def read_e57(path: StrPath) -> Points:
 def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
     """Write an E57 file as a capture folder: ``images/``, ``transforms.json``, ``points.ply``.
 
-    Returns the number of images, and of each one that cannot be used its name and why. SceneError where there is none.
+    Returns the number of images, and the name and reason for each that cannot be used. SceneError if none can.
     """
     path, folder = Path(path), Path(folder)
     if (folder / "images").is_symlink():
@@ -90,7 +90,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """libE57 and the open file; what libE57 raises inside is a SceneError."""
+    """libE57 and the open file; errors of libE57 inside become SceneError."""
     with naming_extra("pye57", "e57"):
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
     with naming(path):
@@ -101,7 +101,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             yield libe57, file
         except (OgPointcloudError, OSError, MemoryError):
             raise
-        except Exception as error:  # libE57's own, and those of its bindings
+        except Exception as error:  # errors of libE57 and of its bindings
             raise SceneError(f"not a whole E57 file ({first_line(error)}): copy or export it again") from None
         finally:
             if file is not None:
@@ -130,7 +130,7 @@ def _number(node: Any, name: str) -> float:
 
 
 def _pose(node: Any) -> DoubleArray | None:
-    """(4, 4) to the file's world, or None where the file has none."""
+    """(4, 4) to the file's world, or None if there is no pose."""
     if not node.isDefined("pose"):
         return None
     pose = node["pose"]
@@ -153,7 +153,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[DoubleArra
         raise SceneError(f"a scan claims {vector.childCount()} points, more than fit into the file: copy it again")
     colors = COLORS if fields.issuperset(COLORS) else ()
     wanted = [*places, *colors, *(name for name in INVALID_STATES if name in fields)]
-    # libE57 fills these arrays chunk by chunk, converted to float64 and scaled (the two True).
+    # libE57 fills these arrays chunk by chunk, converted to float64 and scaled (the two True arguments).
     arrays = {name: np.zeros(min(POINTS_PER_CHUNK, max(vector.childCount(), 1))) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
@@ -168,7 +168,7 @@ def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[DoubleArra
         xyz = xyz if places is CARTESIAN else _from_angles(*xyz.T)
         if pose is not None:
             xyz = xyz @ pose[:3, :3].T + pose[:3, 3]
-        # Each scan says which number is the brightest: 255 or 65535, say.
+        # Each scan states its largest color value: 255 or 65535, for example.
         scaled = [255 * arrays[name][:count][valid] / limit for name, limit in zip(colors, limits, strict=True)]
         rgb = np.clip(np.rint(np.column_stack(scaled)), 0, 255).astype(np.uint8) if colors else None
         parts += [(xyz, rgb)] if len(xyz) else []
@@ -191,7 +191,7 @@ def _color_limit(scan: Any, name: str) -> float:
 
 
 def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, Any]:
-    """Write an image; returns its frame of transforms.json. SceneError says why it cannot be used."""
+    """Write an image; returns its frame for transforms.json. SceneError states why it cannot be used."""
     pose = _pose(image)
     if pose is None:
         raise SceneError("it has no pose")
@@ -206,7 +206,7 @@ def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, A
     suffix, data = _blob(shown, most)
     keys: dict[str, Any] = {"w": width, "h": height}
     if kind == "pinhole":
-        focal = _number(shown, "focalLength")  # a length, as pixelWidth is
+        focal = _number(shown, "focalLength")  # a length, like pixelWidth
         keys |= {"camera_model": "PINHOLE", "fl_x": focal / across, "fl_y": focal / along}
         keys |= {"cx": _number(shown, "principalPointX"), "cy": _number(shown, "principalPointY")}
     else:
@@ -242,7 +242,7 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")
-    # The sphere is twice as wide as high; the image takes its share of the height, in the middle.
+    # The sphere is twice as wide as high; the image takes its part of the height, in the middle.
     whole = width // 2 * 2, width // 2
     shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))
     above = (whole[1] - shown) // 2

@@ -1,12 +1,12 @@
-"""An image of any lens becomes pinhole views: one, if a pinhole can show all that the lens saw, else faces of a cube.
+"""Split an image of any lens into pinhole views: one, if a pinhole can show all that the lens saw, else cube faces.
 
 A single view keeps the image's focal lengths and pose, and extends to the image's rim, which a view of the same size
 would crop. The faces of a cube are called front, left, right, up, down and back; those that the lens does not see are
-left out, the others are cut to what it sees. A face is coarsest in its middle: there it is as sharp as the image is in
-its own, so that resampling loses no edge.
+left out, the others are cropped to what it sees. A face is coarsest in its middle: there it is as sharp as the middle
+of the image, so that resampling loses no edge.
 
-Masks are taken over by nearest pixel, since ids must not be blended. A pixel that the lens never saw is NOT_SEEN, which
-is no evidence of anything, while a pixel outside every mask says that no mask is there.
+Masks are resampled by nearest pixel, since ids must not be blended. A pixel that the lens never saw is NOT_SEEN, which
+is no evidence of anything, while a pixel outside every mask is evidence of no mask.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ MAX_SINGLE_VIEW_TAN = float(np.tan(np.radians(55)))
 CIRCULAR_LENS_RAD = float(np.radians(85))
 """A lens that sees this far from its axis towards the middle of a border draws a circle, with black corners."""
 MIN_FACE_SHARE = 0.005
-"""Share of a cube's face that the lens must see: less is not worth a view."""
+"""A cube face of which the lens sees less than this share is not worth a view."""
 GRID_RAYS = 257
 """Rays per side of the grid on which a lens's field of view is probed."""
 CACHED_MAPS = 12
-"""Faces whose lookup maps for masks are kept, 4 bytes a pixel: those of two cameras whose images are read in turn. Half
-as many maps for images, of 8 bytes a pixel."""
+"""Faces whose lookup maps for masks are kept, 4 bytes per pixel: those of two cameras whose images are read in turn.
+Half as many maps for images, 8 bytes per pixel."""
 CUBE = {
     "front": np.eye(3),
     "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -48,7 +48,7 @@ CUBE = {
 class Face:
     """A pinhole view of what a lens saw.
 
-    name: of the cube's face, "" for a single view. camera: the pinhole, with its pose. whole: size, intrinsics and pose
+    name: of the cube face, "" for a single view. camera: the pinhole, with its pose. whole: size, intrinsics and pose
     of the distorted image, whose projection is ``lens``.
     """
 
@@ -58,7 +58,7 @@ class Face:
     lens: Lens
 
     def of_size(self, width: int, height: int) -> Face:
-        """This view at width x height pixels, with its image scaled alike."""
+        """This view at width x height pixels, with its image scaled by the same factors."""
         size = _scaled(self.whole, width / self.camera.width, height / self.camera.height)
         return replace(self, camera=self.camera.resized(width, height), whole=self.whole.resized(*size))
 
@@ -94,7 +94,7 @@ class Face:
 
     @property
     def _key(self) -> _Key:
-        """All that determines which pixel shows what; views with the same key share their maps."""
+        """Everything that determines the lookup maps; views with the same key share them."""
         return self.name, _numbers(self.camera), _numbers(self.whole), self.lens
 
 
@@ -130,15 +130,15 @@ def _numbers(camera: Camera) -> Numbers:
 def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
     """The visible box of each face, at depth 1. A single view is called "" and spans whole pixels of the image."""
     width, height, fx, fy, cx, cy = whole
-    # A grid twice as wide as the undistorted image would be resolves a telephoto lens; a wide one may see more than
-    # that, and is tried again up to the widest single view.
+    # A grid twice as wide as the undistorted image would be resolves a telephoto lens; a wide lens may see more, and is
+    # tried again up to the widest single view.
     telephoto = 2 * max(abs(cx), abs(width - cx), 1.0) / fx, 2 * max(abs(cy), abs(height - cy), 1.0) / fy
     half = min(max(telephoto), MAX_SINGLE_VIEW_TAN)
     one, _ = _seen_box("front", whole, lens, half)
     if one is None or max(map(abs, one)) >= half:
         half = MAX_SINGLE_VIEW_TAN
         one, _ = _seen_box("front", whole, lens, half)
-    # A box that ends within the grid contains all that the lens sees.
+    # A box that ends within the grid contains everything that the lens sees.
     if one is not None and not lens.wraps and max(map(abs, one)) < half:
         left, top, right, bottom = (round(at * f + c) for at, f, c in zip(one, (fx, fy) * 2, (cx, cy) * 2, strict=True))
         right, bottom = max(right, left + 1), max(bottom, top + 1)

@@ -1,17 +1,16 @@
-"""Depth images -> a cloud, for captures without one: all views' measurements, averaged in voxels and cross-checked.
+"""Depth images -> a cloud, for captures without one: measurements of all views, averaged in voxels and cross-checked.
 
 First pass: pixels that lie on a surface (without flying pixels, which lie between two) are averaged in voxels. Second
 pass: every view votes on every voxel's point: it measured that surface, looked through it, or could not see it. A point
 stays if more views confirm than refute it, and if two confirm it where three or more could have. It then moves to the
 confirming views' mean surface: along each view's ray by the difference of the depths, one step towards the surface of a
-signed distance volume. So a noisy surface becomes one layer instead of as many layers as the noise fills voxels; points
-that then share a voxel are averaged once more.
+signed distance volume. So a noisy surface becomes one layer, not one per voxel that the noise spans; points that then
+share a voxel are averaged once more.
 
-The voxel follows from the images: two pixels wide at the median depth, and not finer than the noise with which views
-contradict each other.
+The voxel size follows from the images: two pixels wide at the median depth, but not finer than the noise between views.
 
-A check (`doubtful_depth`) finds mistakes before a fit of hours does: where views overlap, a depth image of one predicts
-what the other measures; in the wrong unit it predicts another depth, unless the camera only turned.
+A check (`doubtful_depth`) finds mistakes before hours are spent on a fit: where views overlap, a depth image of one
+predicts what the other measures; in the wrong unit the prediction is wrong, unless the camera only turned.
 """
 
 from __future__ import annotations
@@ -34,40 +33,39 @@ SURVEYED_VIEWS = 16
 PIXELS_PER_VIEW = 1000
 """Sampled pixels of a surveyed view, looked up in the others."""
 SAME_SURFACE_SHARE = 0.05
-"""Depths that differ by less than this share may be of one surface: noise is measured on these."""
+"""Depths that differ by less than this share may belong to one surface: noise is measured on these."""
 AGREEING_SHARE = 0.02
 """Depths that differ by less than this share agree."""
 
 PIXELS_PER_VOXEL, NOISE_PER_VOXEL = 2.0, 1.0
-"""Edge of a voxel, in pixel widths and in standard deviations of the noise: the larger of the two."""
+"""Edge of a voxel: the larger of this many pixel widths and this many standard deviations of the noise."""
 MAX_SLOPE = 5.7
-"""Of a surface's depth, in pixel widths per pixel: tan 80, for a surface seen 80 degrees off its normal."""
+"""Change of a surface's depth, in pixel widths per pixel: tan 80, for a surface seen 80 degrees off its normal."""
 LINE_READINGS, MAX_BEND_SHARE = 5, 0.25
-"""This many readings in a row, more than sensors put between two surfaces, are of one surface if the steps of their
-inverse depths differ by at most this share of the largest."""
+"""This many readings in a row, more than sensors put between two surfaces, belong to one surface if the steps of
+their inverse depths differ by at most this share of the largest."""
 VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
 """Largest distance of a point from a measured depth of its surface, in voxels and in deviations of the noise."""
 JUDGING_ROUNDS = 2
-"""Times that all views vote on the points and move them."""
+"""Rounds in which all views vote on the points and move them."""
 VOXELS_ACROSS = 1 << 21
-"""Along each axis, so that a voxel's three indices fit one 64-bit key."""
+"""Voxels along each axis, so that a voxel's three indices fit one 64-bit key."""
 
 CHECKED_VIEWS = 12
 """Views, spread evenly, that the unit check reads."""
 UNIT_FACTORS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
 """Factors between units in use: meters, centimeters, millimeters, 1/4000 and 1/5000 m against 1/1000 m."""
 MIN_AGREEING_SHARE, MIN_SAME_SURFACE_SHARE = 0.2, 0.35
-"""If smaller shares of the depths agree, and are close enough for one surface, the images are no depths of one place.
-Right ones agree in about half of the places; the rest is hidden in one of the views."""
+"""If smaller shares of the depths agree, and are close enough for one surface, the images are not depths of one place.
+Correct depths agree in about half of the places; the rest is hidden in one of the views."""
 MIN_UNIT_GAIN = 0.3
 """Another unit is suggested if it increases the share of agreeing depths by more than this."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """Measured on some frames, used for all. depth: median measured depth. footprint: median width of a pixel on what
-    it sees.
-    noise: standard deviation of one view's depths of a surface, 0 where no two views overlap."""
+    """Measured on some frames, used for all. depth: median measured depth. footprint: median width of a pixel on the
+    surface. noise: standard deviation of one view's depths of a surface, 0 where no two views overlap."""
 
     depth: float
     footprint: float
@@ -80,14 +78,14 @@ class Survey:
 
     @property
     def tolerance(self) -> float:
-        """Distance along the ray, at the median depth, up to which a measured depth is that of a point's surface."""
+        """Distance along the ray, at the median depth, up to which a measured depth belongs to a point's surface."""
         return max(VOXEL_TOLERANCE * self.voxel, NOISE_TOLERANCE * self.noise)
 
 
 @dataclass(frozen=True)
 class FusedCloud:
-    """points: with colors where every frame has them. frames: fused. refused: voxels that other views looked through
-    or that one alone saw. empty: names of frames in which nothing was measured."""
+    """points: with colors if every frame has them. frames: number fused. refused: number of voxels that other views
+    looked through or that only one saw. empty: names of frames in which nothing was measured."""
 
     points: Points
     survey: Survey
@@ -102,7 +100,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
     Raises SceneError where no frame measures anything, or a file cannot be read.
     """
     found = survey(frames)
-    # Among the cameras: voxels are counted from there, and few enough in each direction to fit their key.
+    # The origin lies among the cameras, so that voxel indices, counted from it, fit their key.
     origin = np.median([frame.depth.camera.center for frame in frames], axis=0)
     voxels = _Voxels(found.voxel)
     empty = []
@@ -148,7 +146,7 @@ def survey(frames: Sequence[DepthFrame]) -> Survey:
     off = np.abs(_differences(images))
     comparable = off[off < SAME_SURFACE_SHARE]
     # 1.4826: from the median of absolute values to a standard deviation. The difference of two views has the noise of
-    # both, the root of two times that of one; it is relative, so that it counts at the typical depth.
+    # both, sqrt(2) times that of one; it is relative, so it is scaled by the typical depth.
     noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
     return Survey(typical, float(np.median(np.concatenate(widths))), float(noise))
 
@@ -161,8 +159,8 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
 
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
     """(H, W) bool: of every ``step``-th reading along each axis, those on one surface with a neighbor in their row and
-    in their column. slanted: readings on a surface seen at a flatter angle count too, if they are one of LINE_READINGS
-    on a line. A map takes these, as it knows what its frames measured; in a fused cloud such points would hide each
+    in their column. slanted: readings on a surface seen at a flatter angle count too, if they are among LINE_READINGS
+    on a line. A map uses these, as it knows what its frames measured; in a fused cloud such points would hide each
     other from a fit."""
     steepest = MAX_SLOPE / image.camera.fx, MAX_SLOPE / image.camera.fy
     return _on_surface(image.depth, step, steepest, NOISE_TOLERANCE * noise, slanted)
@@ -170,8 +168,7 @@ def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
-    """See `on_surface`. steepest: change of depth a pixel, as a share of it, along rows and columns; slack: beside
-    it."""
+    """See `on_surface`. steepest: relative change of depth per pixel along rows and columns; slack: added to it."""
     height, width = depth.shape
     chosen, none = np.zeros(depth.shape, np.bool_), np.float32(0)
     for row in range(step // 2, height, step):
@@ -195,13 +192,13 @@ def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _near(z, other, steepest, slack):  # noqa: ANN001, ANN202
-    """Whether two depths side by side, 0 unmeasured, are of one surface."""
+    """Whether two adjacent depths, 0 unmeasured, belong to one surface."""
     return other > 0 and abs(other - z) <= min(other, z) * steepest + slack
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_a_line(line, k):  # noqa: ANN001, ANN202
-    """Whether reading k of a row or column is one of LINE_READINGS on a line. Inverse depths of a plane are linear in
+    """Whether reading k of a row or column is among LINE_READINGS on a line. Inverse depths of a plane are linear in
     the image; those of readings between two surfaces lie anywhere."""
     for first in range(max(k - LINE_READINGS + 1, 0), min(k, len(line) - LINE_READINGS) + 1):
         low, high = np.inf, -np.inf
@@ -230,11 +227,11 @@ def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) 
 
 
 def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> DoubleArray:
-    """Relative differences between depths of some pixels and what the other images measured at the same places, all
-    depths taken times ``factor``."""
+    """Relative differences between depths of some pixels and the depths that other images measured at the same places,
+    all depths multiplied by ``factor``."""
     found = [np.zeros(0)]
     for index, image in enumerate(images):
-        # About PIXELS_PER_VIEW measured pixels, evenly spread; each is looked up in all other images.
+        # About PIXELS_PER_VIEW measured pixels, evenly spread, each looked up in all other images.
         sampled = np.zeros(image.depth.shape, bool)
         rows = np.flatnonzero(image.depth)
         sampled.reshape(-1)[rows[:: 1 + len(rows) // PIXELS_PER_VIEW]] = True
@@ -247,7 +244,7 @@ def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> DoubleArr
 
 
 def _seen(xyz: DoubleArray, camera: Camera) -> tuple[NDArray[np.intp], DoubleArray]:
-    """Flat pixels and depths of the world points that fall into the image."""
+    """Flat pixel indices and depths of the world points that fall into the image."""
     uv_px, depth = camera.project(xyz)
     inside = camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
@@ -257,7 +254,7 @@ def _seen(xyz: DoubleArray, camera: Camera) -> tuple[NDArray[np.intp], DoubleArr
 def _judge(
     xyz: DoubleArray, origin: DoubleArray, frames: Sequence[DepthFrame], found: Survey
 ) -> tuple[NDArray[np.bool_], DoubleArray]:
-    """(n,) bool, which points the views confirm, and (n, 3), where these then lie. xyz: relative to the origin."""
+    """(n,) bool, which points the views confirm, and (n, 3) their new positions. xyz: relative to the origin."""
     cv2 = require_cv2()
     votes, shift = np.zeros((len(xyz), 3), np.int32), np.zeros((len(xyz), 4))
     for frame in frames:
@@ -271,7 +268,7 @@ def _judge(
         _add_votes(xyz, seen_from, depths, limits, votes, shift)
     confirmed, refuted, could_see = votes.T
     stays = (confirmed > refuted) & (confirmed >= np.where(could_see >= 3, 2, 1))
-    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)  # weight 0: no shift either
+    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)  # weight 0: shift 0
 
 
 @njit(cache=True, parallel=True)
@@ -280,7 +277,7 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
 
     seen_from: rotation to the camera, its center, and fx, fy, cx, cy. depths: (H, W) as measured; the same without
     flying pixels; the smallest of 3x3 pixels, 0 if one of them is unmeasured. limits: the tolerance, and the typical
-    depth that it is of.
+    depth at which it holds.
     """
     rotation, center, (fx, fy, cx, cy) = seen_from
     (depth, surface, nearest), (tolerance, typical) = depths, limits
@@ -297,14 +294,14 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
         v, u = int(row), int(column)
         # Noise and the width of pixels grow with depth.
         allowed = tolerance * max(1.0, along / typical)
-        # The view could see the point if it measured nothing in front, and refutes it if all pixels around lie behind.
+        # The view could see the point if it measured nothing in front; it refutes it if all pixels around are behind.
         votes[i, 2] += depth[v, u] >= along - allowed
         votes[i, 1] += nearest[v, u] > along + allowed
         difference = surface[v, u] - along
         if surface[v, u] > 0 and abs(difference) <= allowed:
             votes[i, 0] += 1
-            # (x, y, z) / along is the ray to the depth 1, so that the point moves to the measured depth. Nearer views
-            # measure better: by the inverse square of the depth.
+            # (x, y, z) / along is the ray to depth 1, so that the point moves to the measured depth. Nearer views
+            # measure better: weights are the inverse square of the depth.
             weight = 1.0 / (along * along)
             shift[i, 0] += weight * difference * x / along
             shift[i, 1] += weight * difference * y / along
@@ -313,8 +310,8 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
 
 
 class _Voxels:
-    """Mean position and color by voxel. _merged: the keys, ascending, and of each the sums of x, y, z, r, g, b and the
-    number of points; _waiting: points that are not added to these yet."""
+    """Mean position and color by voxel. _merged: the keys, ascending, and for each the sums of x, y, z, r, g, b and the
+    number of points; _waiting: points not yet merged."""
 
     def __init__(self, edge: float) -> None:
         self._edge = edge
@@ -329,11 +326,11 @@ class _Voxels:
                 f"{source} has points {farthest:.3g} from the middle of the cameras, in voxels of {self._edge:.3g}; "
                 f"expected fewer than {VOXELS_ACROSS // 2} voxels: check its pose and the depth unit"
             )
-        # Indices from 0 on, 21 bits each, as one number.
+        # Indices from 0, 21 bits each, as one number.
         x, y, z = (np.floor(xyz / self._edge).astype(np.int64) + VOXELS_ACROSS // 2).T
         keys = (x * VOXELS_ACROSS + y) * VOXELS_ACROSS + z
         self._waiting.append((keys, np.column_stack([xyz, rgb, np.ones(len(xyz))])))
-        # Merge only once as many wait as are merged: a voxel is then sorted a few times, not once a frame.
+        # Merge only when as many points wait as are merged: a voxel is then sorted a few times, not once per frame.
         if sum(len(keys) for keys, _ in self._waiting) > len(self._merged[0]):
             self._merge()
 
@@ -350,16 +347,16 @@ class _Voxels:
 
 
 def _summed(keys: NDArray[np.int64], rows: DoubleArray) -> tuple[NDArray[np.int64], DoubleArray]:
-    """The keys that occur, ascending, and the sum of each one's rows, added up in their order."""
+    """The keys that occur, ascending, and the sum of the rows of each, added in order."""
     unique, index = np.unique(keys, return_inverse=True)
     sums = [np.bincount(index, column, len(unique)) for column in rows.T]
     return unique, np.column_stack(sums).astype(np.float64, copy=False)
 
 
 def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
-    """A warning, with the cure, where views agree clearly better if all depths are taken in another unit, or agree in
-    no unit; None where neither is so."""
-    # Poses keep their unit, so that only the right one makes depths agree.
+    """A warning, with the cure, where views agree clearly better with all depths in another unit, or agree in no unit;
+    else None."""
+    # Poses keep their unit, so that depths only agree in the right one.
     images = [image for frame in evenly(frames, CHECKED_VIEWS) if (image := frame.depth.read()).depth.any()]
     shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNIT_FACTORS)}
     best = max(UNIT_FACTORS, key=shares.__getitem__)
@@ -385,6 +382,6 @@ def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
 
 
 def _agreement(images: Sequence[DepthImage], factor: float, within: float = AGREEING_SHARE) -> float:
-    """Share of depths that another view confirms if all are taken times ``factor``; NaN where no views overlap."""
+    """Share of depths that another view confirms if all are multiplied by ``factor``; NaN where no views overlap."""
     off = _differences(images, factor)
     return float((np.abs(off) < within).mean()) if len(off) else float("nan")

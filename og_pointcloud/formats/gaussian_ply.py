@@ -1,9 +1,9 @@
 """3D Gaussian splatting PLY files -> Points: scales linear, rotations unit wxyz, opacities in [0, 1], base color.
 
-Two layouts. *Trained* (Inria, gsplat, nerfstudio, OpenGaussian): a float property each, before activation: log scale,
-logit opacity, any quaternion, color as the constant spherical harmonic. *Compressed* (SuperSplat): an element
-``chunk`` with the bounds of 256 splats each, and four packed 32-bit words per splat. Harmonics above the constant one,
-instance features and normals are not read: nothing here renders color by direction.
+Two layouts. *Trained* (Inria, gsplat, nerfstudio, OpenGaussian): one float property per value, before activation: log
+scale, logit opacity, quaternion of any length, color as the constant spherical harmonic. *Compressed* (SuperSplat): an
+element ``chunk`` with the bounds of every 256 splats, and four packed 32-bit words per splat. Higher harmonics,
+instance features and normals are not read: nothing here renders view-dependent color.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Elements = Mapping[str, NDArray[np.void]]
 
 
 def latest_iteration(folder: Path) -> Path | None:
-    """The .ply that a training run saved last: point_cloud/iteration_N/point_cloud.ply of the largest N."""
+    """The last .ply that a training run saved: point_cloud/iteration_N/point_cloud.ply with the largest N."""
     iterations = {
         int(match.group(1)): file
         for file in folder.glob("point_cloud/iteration_*/point_cloud.ply")
@@ -64,7 +64,7 @@ def gaussian_rows(points: Points) -> NDArray[np.void]:
 
 
 def holds_gaussians(elements: Elements) -> bool:
-    """Whether a PLY's elements are Gaussians of either layout, rather than a plain cloud."""
+    """Whether a PLY's elements are Gaussians in either layout, rather than a plain cloud."""
     return _are_compressed(elements) or not {"scale_0", "rot_0"}.isdisjoint(_names(elements))
 
 
@@ -72,8 +72,8 @@ def gaussians_from_ply(elements: Elements) -> Points:
     """Gaussians from the elements of a trained or compressed 3DGS file; world coordinates, the median as origin.
 
     A zero quaternion is no rotation. Opacity logits of +-inf are 1 and 0, a log scale of -inf is 0: some converters
-    write them for splats that are fully opaque, invisible or flat. SceneError where a property is missing or anything
-    else is not finite, also a log scale above 88.7, whose exponential leaves float32.
+    write them for splats that are fully opaque, invisible or flat. SceneError where a property is missing, any
+    other value is not finite, or a log scale is above 88.7, whose exponential overflows float32.
     """
     if "vertex" not in elements:
         raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}")
@@ -85,7 +85,7 @@ def _are_compressed(elements: Elements) -> bool:
 
 
 def _names(elements: Elements) -> tuple[str, ...]:
-    """Properties of the vertices; empty without vertices."""
+    """Names of the vertex properties; empty without vertices."""
     return elements["vertex"].dtype.names or () if "vertex" in elements else ()
 
 
@@ -96,7 +96,7 @@ def _trained(vertex: NDArray[np.void]) -> Points:
     opacity = 0.5 + 0.5 * np.tanh(0.5 * stack_columns(vertex, ("opacity",))[:, 0])
     if "f_dc_0" in (vertex.dtype.names or ()):
         color = 0.5 + SH_CONSTANT * stack_columns(vertex, BASE_COLOR)
-    else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colors
+    else:  # nerfstudio's exporter can write red, green, blue instead
         rgb = colors(vertex)
         color = None if rgb is None else rgb / 255
     return activated(positions(vertex), scale, stack_columns(vertex, ROTATION), opacity, color)
@@ -110,7 +110,7 @@ def _compressed(elements: Elements) -> Points:
             f"{len(vertex)} packed splats in {len(chunk)} chunks of {SPLATS_PER_CHUNK}; expected {expected} chunks: "
             "the file is damaged"
         )
-    # Each word holds its fields from the highest bit down, as shares of the chunk's bounds.
+    # Each word holds its fields from the highest bit down, as fractions of the range between the chunk's bounds.
     words = {}
     for name in ("packed_position", "packed_rotation", "packed_scale", "packed_color"):
         if name not in (vertex.dtype.names or ()) or vertex.dtype[name] != np.uint32:
@@ -121,19 +121,19 @@ def _compressed(elements: Elements) -> Points:
     log_scale = _between(chunk, ("scale_x", "scale_y", "scale_z"), _unpack(words["packed_scale"]))
     rgba = _unpack(words["packed_color"], bits=(8, 8, 8, 8))
     color = rgba[:, :3]
-    if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; before it, colors have no bounds
+    if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; earlier versions have no color bounds
         color = _between(chunk, ("r", "g", "b"), color)
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
-    # Two bits name the largest of w, x, y, z; the others have ten each, of +-1/sqrt(2).
-    # The largest part of a unit quaternion follows from the others, and none of these exceeds 1/sqrt(2).
+    # Two bits name the largest of w, x, y, z; the others have ten each, for +-1/sqrt(2).
+    # The largest component of a unit quaternion follows from the others, none of which exceeds 1/sqrt(2).
     others = (_unpack(words["packed_rotation"], bits=(2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
     rotation = from_smallest_three(words["packed_rotation"] >> 30, others)
     return activated(xyz, scale, rotation, rgba[:, 3], color)
 
 
 def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> DoubleArray:
-    """Fields of ``bits`` bits, the first uppermost, as (n, len(bits)) shares in [0, 1] of a field's largest value."""
+    """Fields of ``bits`` bits, highest first, as (n, len(bits)) fractions in [0, 1] of a field's largest value."""
     shares = np.empty((len(words), len(bits)))
     shift = sum(bits)
     for column, width in enumerate(bits):
@@ -144,7 +144,7 @@ def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> 
 
 
 def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: DoubleArray) -> DoubleArray:
-    """(n, len(names)) values at ``share`` of the way from the minimum to the maximum of each splat's chunk."""
+    """(n, len(names)) values interpolated by ``share`` from the minimum to the maximum of each splat's chunk."""
     minimum, maximum = (stack_columns(chunk, [f"{end}_{name}" for name in names]) for end in ("min", "max"))
     of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
     with np.errstate(invalid="ignore"):  # infinite bounds give NaN, which is reported as such
@@ -152,8 +152,8 @@ def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: DoubleArray
 
 
 def from_smallest_three(largest: NDArray[np.integer], others: DoubleArray) -> DoubleArray:
-    """(n, 4) unit quaternions. largest: (n,) place of the largest part, which is positive; others: (n, 3), the other
-    parts in their order."""
+    """(n, 4) unit quaternions. largest: (n,) index of the largest component, which is positive; others: (n, 3), the
+    other components in order."""
     quaternions, is_largest = np.empty((len(others), 4)), np.arange(4) == largest[:, None]
     quaternions[is_largest] = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
     quaternions[~is_largest] = others.ravel()
@@ -173,7 +173,7 @@ def activated(
     if color is not None:
         parts["color"] = color
     if not all(np.isfinite(values).all() for values in parts.values()):
-        # Only now by row: which Gaussian is the first, and what in it.
+        # Checked by row only now: find the first such Gaussian, and which of its values.
         finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
         usable = np.logical_and.reduce(list(finite.values()))
         first = int(np.argmin(usable))
@@ -183,7 +183,7 @@ def activated(
             f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
         )
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    # The rotation matrix formula gives the identity for a zero quaternion: so renderers show such splats unrotated.
+    # The rotation matrix formula gives the identity for a zero quaternion, so renderers show such splats unrotated.
     unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
     rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
     return Points.from_world(

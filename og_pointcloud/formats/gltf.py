@@ -1,9 +1,9 @@
-"""Labelled clouds and splats as glTF 2.0, binary (.glb). Out only.
+"""Write labelled clouds and splats as binary glTF 2.0 (.glb).
 
-Points have colors, splats also what KHR_gaussian_splatting adds (viewers without it draw points). Label and instance
-are feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1), with their names in property tables
-(EXT_structural_metadata), which Cesium shows for a picked feature and styles by. Score and reason are attributes of our
-own; names stand in the mesh's extras too.
+Points have colors; splats also have the attributes of KHR_gaussian_splatting (viewers without it draw points). Label
+and instance are feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1), with their names in
+property tables (EXT_structural_metadata), which Cesium shows for a picked feature and uses for styling. Score and
+reason are custom attributes; names are also in the mesh's extras.
 
 Format: Khronos, "glTF 2.0 Specification", and the extensions' texts.
 """
@@ -33,11 +33,11 @@ GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
 FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
 SPLATS = "KHR_gaussian_splatting"
 SPLATS_AS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-"""How splats are trained: sRGB colors as they are shown."""
+"""As splats are trained: display-referred sRGB colors."""
 ALIGNMENT = 8
-"""Bytes, of all that lies in the buffer: property tables need 8, columns of vertices 4."""
+"""Bytes, for everything in the buffer: property tables need 8, vertex columns 4."""
 NAME = "name"
-"""The property of both tables: a label's name, and the name of an instance's label."""
+"""The property of both tables: the name of a label, and of an instance's label."""
 
 
 def write_gltf(
@@ -51,13 +51,13 @@ def write_gltf(
     """Write a labelled cloud as .glb; whole or not at all.
 
     xyz_world: (n, 3), n at least 1; stored as float32 around their median, which is the node's translation. Axes stay
-        as they are: glTF takes y to be up, so turn a scene with z up in the viewer.
-    rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colors.
+        as they are: glTF assumes y up, so rotate a scene with z up in the viewer.
+    rgb: (n, 3) uint8 sRGB; stored linear, as the format requires.
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8. Ids below 0 become the
-        feature id that says "none"; og_reason tells which none.
-    names: what og_label counts.
-    splats: Gaussians, row by row those of xyz_world; their shape and opacity are kept, their color is ``rgb``.
-    SceneError where there are no points or a coordinate is not finite, also in float32.
+        null feature id; og_reason tells them apart.
+    names: those that og_label indexes.
+    splats: Gaussians in the order of xyz_world; their shape and opacity are kept, their color is ``rgb``.
+    SceneError where there are no points, or a coordinate is not finite, before or after conversion to float32.
     """
     path = Path(path)
     with naming(path):
@@ -85,14 +85,14 @@ def write_gltf(
 
 
 class _Buffer:
-    """The bytes behind a document, and its views of them."""
+    """The binary buffer of a document, and its buffer views."""
 
     def __init__(self) -> None:
         self.data = bytearray()
         self.views: list[dict[str, int]] = []
 
     def add(self, data: bytes, **more: int) -> int:
-        """Append data, aligned, and return the number of its view. more: further entries of the view."""
+        """Append data, aligned, and return the index of its buffer view. more: further entries of the view."""
         self.data += bytes(-len(self.data) % ALIGNMENT)
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
         self.data += data
@@ -114,7 +114,7 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
 
 
 def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.uint16]:
-    """(n, 4) uint16 linear color and opacity, 1 without splats. 16 bits, as 8 linear ones would lose the dark
+    """(n, 4) uint16 linear color, and opacity, 1 without splats. 16 bits: 8 bits of linear color would lose dark
     colors."""
     # The transfer function of sRGB, IEC 61966-2-1.
     share = np.arange(256) / 255
@@ -131,7 +131,7 @@ def _document(
     names: Sequence[str],
     buffer: _Buffer,
 ) -> dict[str, Any]:
-    """The JSON document of one mesh with one set of points; its columns are appended to the buffer."""
+    """The JSON document of one mesh with one point primitive; its columns are appended to the buffer."""
     accessors = [_accessor(buffer, column, with_bounds=name == "POSITION") for name, column in columns.items()]
     attributes = {name: index for index, name in enumerate(columns)}
     primitive = {"attributes": attributes, "mode": POINTS_MODE, "extensions": extensions}
@@ -147,8 +147,8 @@ def _document(
 
 
 def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> list[str]:
-    """The name of each instance's label, "" where it has none. All points of an instance have one label: the first of
-    each is read."""
+    """The name of each instance's label, "" where it has none. All points of an instance share a label, so that of its
+    first point is used."""
     ids, labels = attributes["og_instance"], attributes["og_label"]
     named = [""] * (int(ids.max(initial=-1)) + 1)
     present, first = np.unique(ids, return_index=True)
@@ -161,15 +161,15 @@ def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> 
 def _feature_sets(
     attributes: Mapping[str, NDArray], tables: Mapping[str, Sequence[str]], document: dict[str, Any], buffer: _Buffer
 ) -> list[dict[str, Any]]:
-    """The feature sets of a primitive, by tables of their names, which become the document's property tables.
+    """The feature sets of a primitive, one per table of names; the tables become the document's property tables.
 
-    Strings are one UTF-8 text, with the offsets of their starts and the end. A table without any text is left out: a
-    buffer cannot be empty.
+    Strings are stored as one UTF-8 text, with the offset of each start and of the end. A table without any text is left
+    out: a buffer cannot be empty.
     """
     feature_sets, classes, made = [], {}, []
     for index, (name, texts) in enumerate(tables.items()):
         ids = attributes[name]
-        count = max(len(np.unique(ids[ids >= 0])), 1)  # at least 1, as the schema has it
+        count = max(len(np.unique(ids[ids >= 0])), 1)  # the schema requires at least 1
         feature_sets.append({"featureCount": count, "nullFeatureId": len(texts), "attribute": index, "label": name})
         encoded = [text.encode() for text in texts]
         if any(encoded):  # len(texts) + 1 offsets, the last one the end
@@ -196,14 +196,14 @@ def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[st
     }
     if column.dtype == np.uint16:
         accessor["normalized"] = True
-    if with_bounds:  # which the specification demands of positions
+    if with_bounds:  # required for positions by the specification
         accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
     return accessor
 
 
 def _as_glb(document: Mapping[str, Any], buffer: _Buffer) -> bytes:
     """Binary glTF (section 4 of the specification): a header of 12 bytes, then a JSON and a binary chunk. Chunks are
-    multiples of 4 bytes, JSON filled up with spaces, binary with zeros."""
+    padded to multiples of 4 bytes, JSON with spaces, binary with zeros."""
     binary = bytes(buffer.data) + bytes(-len(buffer.data) % 4)
     whole = {**document, "bufferViews": buffer.views, "buffers": [{"byteLength": len(binary)}]}
     text = json.dumps(whole, separators=(",", ":")).encode()

@@ -1,4 +1,4 @@
-"""Image files of a capture: where they lie, how large they are, and their pixels."""
+"""Image files of a capture: their locations, sizes and pixels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PngHeader(NamedTuple):
 def require_cv2() -> ModuleType:
     """OpenCV, or an error that names the extra."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when it is imported
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warning of a damaged file stands beside our error
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # its warning of a damaged file would repeat our error
     with naming_extra("opencv-contrib-python-headless", "fit"):
         import cv2
     return cv2
@@ -47,16 +47,16 @@ def require_pillow() -> ModuleType:
 
 
 def without_suffix(path: str) -> str:
-    """``path`` without its image suffix. Only a known suffix goes: ``frame.0001`` is a name, not a ``.0001`` file."""
+    """``path`` without its image suffix. Only known suffixes are removed: ``frame.0001`` has none."""
     suffix = PurePosixPath(path).suffix
     return path[: -len(suffix)] if suffix.lower() in IMAGE_SUFFIXES else path
 
 
 def find_image(capture: Path, path: str) -> Path | None:
-    """The file that a pose file means by ``path``, or None.
+    """The file that ``path`` in a pose file refers to, or None.
 
-    Tried: the path inside the capture folder, then inside its image folders; each also with an image suffix added. A
-    path that leads out of the capture folder is never opened: its file name is looked for in the image folders.
+    The path is tried inside the capture folder, then inside its image folders; each also with an image suffix added. A
+    path that leads out of the capture folder is never opened: its file name is searched for in the image folders.
     """
     inside = posixpath.normpath(path)
     if inside.startswith(("/", "..")):  # absolute paths of the machine that wrote the file, or worse
@@ -83,10 +83,10 @@ def png_header(file: Path) -> PngHeader | None:
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """(width, height) of an image file, as its header states it. SceneError beyond MAX_PIXELS."""
+    """(width, height) of an image file, from its header. SceneError beyond MAX_PIXELS."""
     with file.open("rb") as stream:
         size = stated_size(stream, file)
-    if size is None:  # of a kind that is not known here
+    if size is None:  # a format that is not known here
         height, width = decoded(file, require_cv2().IMREAD_GRAYSCALE).shape[:2]
         return width, height
     return size
@@ -100,7 +100,7 @@ def _check_pixels(name: Path | str, width: int, height: int) -> None:
 
 
 def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
-    """(width, height) as the header of a PNG, JPEG, BMP, WebP or TIFF states it; None where there is no such header.
+    """(width, height) from the header of a PNG, JPEG, BMP, WebP or TIFF; None for other headers.
 
     No pixel is decoded. SceneError, which begins with ``name``, beyond MAX_PIXELS.
     """
@@ -111,13 +111,13 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
         PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, BmpImagePlugin.BmpImageFile,
         WebPImagePlugin.WebPImageFile, TiffImagePlugin.TiffImageFile,
     )  # fmt: skip
-    for kind in kinds:  # and not Image.open, which warns of images from two thirds of MAX_PIXELS on
+    for kind in kinds:  # not Image.open, which warns of images from two thirds of MAX_PIXELS on
         stream.seek(0)
         try:
             width, height = kind(stream).size
-        except pillow.DecompressionBombError as error:  # which WebP's reader raises by itself
+        except pillow.DecompressionBombError as error:  # raised by WebP's own reader
             raise SceneError(f"{name}: {error}; expected at most {MAX_PIXELS} pixels: scale it down") from None
-        except Exception:  # of many kinds, whatever another or a damaged header leads a reader to
+        except Exception:  # many types: readers fail in many ways on foreign or damaged headers
             continue
         _check_pixels(name, width, height)
         return width, height
@@ -125,10 +125,10 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
 
 
 def decoded(file: Path, flags: int) -> NDArray[np.generic]:
-    """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
+    """The pixels as OpenCV decodes them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
-    stated_size(io.BytesIO(data.tobytes()), file)  # which refuses too many pixels before OpenCV takes memory for them
+    stated_size(io.BytesIO(data.tobytes()), file)  # refuses too many pixels before OpenCV allocates them
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except cv2.error:
@@ -139,7 +139,7 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
 
 
 def palette_indices(file: Path) -> NDArray[np.uint8]:
-    """(H, W) the entries of a PNG's palette, as video trackers write ids; OpenCV would give their colors."""
+    """(H, W) palette indices of a PNG, which video trackers use as ids; OpenCV would return colors."""
     try:
         with require_pillow().open(file, formats=("PNG",)) as image:
             return np.asarray(image, np.uint8)
@@ -152,7 +152,7 @@ def _undecodable(file: Path, size: int) -> SceneError:
 
 
 def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 RGB, resized to ``size`` (width, height); its shape must agree within a pixel."""
+    """(H, W, 3) uint8 RGB, resized to ``size`` (width, height); the aspect ratios must agree within a pixel."""
     cv2 = require_cv2()
     image = decoded(file, cv2.IMREAD_COLOR)
     height, width = image.shape[:2]
@@ -165,7 +165,7 @@ def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 def require_scaled(
     what: str, size: tuple[int, int], camera: tuple[int, int], cure: str = "fix the width and height of the pose file"
 ) -> None:
-    """SceneError, which begins with ``what``, where a size (width, height) is not its camera's, or that scaled."""
+    """SceneError, which begins with ``what``, where a size (width, height) is not its camera's, up to scale."""
     if not same_shape(size, camera):
         raise SceneError(
             f"{what} {size[0]}x{size[1]} pixels, its camera {camera[0]}x{camera[1]}; expected the same size or a "
@@ -174,7 +174,7 @@ def require_scaled(
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size (width, height) is the other scaled, but for rounding by at most a pixel of the smaller."""
+    """Whether two sizes (width, height) have the same aspect ratio, up to rounding by a pixel of the smaller."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 

@@ -1,13 +1,13 @@
-"""KITTI-360: the rectified stereo images of a drive, as the data set's documentation lays them out.
+"""KITTI-360: the rectified stereo images of a drive, in the layout of the data set's documentation.
 
 calibration/perspective.txt                      ``S_rect_00: 1408 376``, ``P_rect_00:`` 12 numbers, row by row
-data_poses/DRIVE/cam0_to_world.txt               a frame's number, then 16: the rectified left camera to the world,
-                                                 OpenCV axes, meters; keyframes alone
-data_2d_raw/DRIVE/image_00/data_rect/*.png       and image_01, the right camera: named by the frame, ten digits
+data_poses/DRIVE/cam0_to_world.txt               frame number, then 16 numbers: rectified left camera to world,
+                                                 OpenCV axes, meters; keyframes only
+data_2d_raw/DRIVE/image_00/data_rect/*.png       and image_01, the right camera: named by frame number, ten digits
 data_3d_semantics/*/DRIVE/static/FIRST_LAST.ply  a cloud of these frames: the capture's geometry, if there is one file
 
-The right camera stands beside the left one: P_rect_01 has the distance times the focal length in its last column. The
-fisheye images to the sides (image_02, image_03) are not read.
+The right camera is offset sideways from the left one: the last column of P_rect_01 holds the baseline times the focal
+length. The fisheye images to the sides (image_02, image_03) are not read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def is_kitti360(folder: Path) -> bool:
 
 
 def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
-    """Frames of the one drive whose images are there, the left ones first. SceneError names file and cure."""
+    """Frames of the one drive that has images, left images first. SceneError names file and cure."""
     poses_file = _poses_of_drive(folder)
     rows = read_numbers(poses_file, 17)
     pose_of_frame = dict(zip(rows[:, 0].tolist(), rows[:, 1:].reshape(-1, 4, 4), strict=True))
@@ -54,7 +54,7 @@ def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
 
 
 def find_static_cloud(folder: Path) -> Path | None:
-    """The accumulated cloud, None where there is none; SceneError for several, of which each has some of the frames."""
+    """The accumulated cloud, or None; SceneError for several, as each covers only some of the frames."""
     return the_only(folder, "data_3d_semantics/*/*/static/*.ply", "static clouds, each of some frames,")
 
 
@@ -64,7 +64,7 @@ def _images_folder(folder: Path, drive: str, camera: str) -> Path:
 
 def _poses_of_drive(folder: Path) -> Path:
     files = sorted(folder.glob("data_poses/*/cam0_to_world.txt"))
-    # Poses come for all drives at once, images drive by drive.
+    # Poses are published for all drives together, images drive by drive.
     seen = [file for file in files if _images_folder(folder, file.parent.name, "00").is_dir()]
     if len(seen) != 1:
         drives = ", ".join(file.parent.name for file in seen[:3]) or "none"
@@ -76,14 +76,14 @@ def _poses_of_drive(folder: Path) -> Path:
 
 
 def _sensor(file: Path, camera: str) -> tuple[Sensor, NDArray[np.float64]]:
-    """The lens of a rectified camera, and its place in the left one's frame, (4, 4)."""
+    """The lens of a rectified camera, and its pose in the left camera's frame, (4, 4)."""
     parts = (line.partition(":") for line in read_text(file).splitlines())
     lines = {key: numbers for key, _, numbers in parts}
     width, height = _stated(lines, f"S_rect_{camera}", 2, file)
-    # P = K [I | t] for points of the left camera's frame: its last column holds fx t_x, and the camera stands at -t_x.
+    # P = K [I | t] for points in the left camera's frame: its last column holds fx t_x; the camera center is at -t_x.
     projection = np.reshape(_stated(lines, f"P_rect_{camera}", 12, file), (3, 4))
     sensor = Sensor.from_matrix((round(width), round(height)), projection)
-    beside = -projection[0, 3] / (projection[0, 0] or 1.0)  # the camera refuses a focal length of 0
+    beside = -projection[0, 3] / (projection[0, 0] or 1.0)  # `Camera` refuses a focal length of 0
     return sensor, rigid(np.eye(3), np.array([beside, 0.0, 0.0]))
 
 

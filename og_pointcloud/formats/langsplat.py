@@ -1,12 +1,12 @@
 """LangSplat's ``language_features``: ``<view name>_s.npy`` [4, H, W] of ids, ``<view name>_f.npy`` [M, D] of features.
 
-The four levels are SAM's default, small, medium and large masks. Ids are cumulative: the small level goes on counting
+The four levels are SAM's default, small, medium and large masks. Ids are cumulative: the small level continues
 where the default level ended, so an id is a row of the feature file whatever its level; -1 is outside every mask.
 OpenGaussian trains on one level, the large one. Tools that make masks of one level may write it as all four.
 
-One level is read. Its rows are compacted (rows that no pixel of the level shows are left out), and a view whose level
-holds no mask stays a view without masks: other levels never stand in for it, since one view's small masks
-would contradict its neighbors' large ones.
+One level is read. Its rows are compacted (rows that no pixel of the level shows are left out). A view without a mask at
+this level stays without masks: other levels never replace it, since the small masks of one view would contradict the
+large masks of its neighbors.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ LEVELS = ("default", "small", "medium", "large")
 SPACE_FILE = "feature_space.txt"
 WORDS_FILE = "text_features.npz"
 LANGSPLAT_SPACE = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
-"""The encoder of LangSplat's own scripts, 512-d, unless ``feature_space.txt`` in the folder names another, or the
-capture's own words, of the same width, are of another."""
+"""The encoder of LangSplat's own scripts, 512-d, unless ``feature_space.txt`` in the folder, or the capture's text
+features of the same width, name another."""
 LANGSPLAT_WIDTH = 512
 
 
 def read_language_features(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
     """The masks of these views at one level and the name of their feature space.
 
-    Each id map is read here once, to find the rows that the level uses, and again when its layer is. Raises SceneError
+    Each id map is read here once, to find the rows that the level uses, and again when its layer is read. SceneError
     where a file is missing, an id has no feature row, or no view has a mask at this level.
     """
     if level not in LEVELS:
@@ -49,7 +49,7 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
     cure = "run the mask and feature extraction on all images"
     require_all(id_files, cure)
     require_all(feature_files, cure)
-    # Each map is decoded once here for the rows that it shows, and let go: hundreds of them would not fit into memory.
+    # Each map is decoded here for the rows that it shows, then freed: hundreds of them would not fit into memory.
     layers = [_layer(ids, features, level) for ids, features in zip(id_files, feature_files, strict=True)]
     empty = [name for name, layer in zip(names, layers, strict=True) if not len(layer.features)]
     if len(empty) == len(names):
@@ -79,7 +79,7 @@ def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
 
 
 def _rows(id_file: Path, level: str, row_of_id: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(H, W): each pixel's row among those that the level uses, -1 outside every mask."""
+    """(H, W): each pixel's index among the rows that the level uses, -1 outside every mask."""
     return row_of_id[_level_ids(id_file, level)]
 
 

@@ -1,12 +1,12 @@
-"""LAS and LAZ in and out, through laspy (extra 'las').
+"""Read and write LAS and LAZ, through laspy (extra 'las').
 
-Out: LAS 1.4, with labels where each kind of reader looks for them: ``classification`` for viewers, and extra bytes
-og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud. Points of a
-file keep all that it says of them, and its coordinate system; others are of point format 7.
+Written as LAS 1.4, with labels where each kind of reader looks for them: ``classification`` for viewers, and extra
+bytes og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud. Points
+of a LAS file keep their attributes and coordinate system; others are written in point format 7.
 
 Before a file is read, the counts in its header are checked against its size: laspy reads as many records as the header
-says, if need be four billion empty ones, and lazrs takes memory for every chunk and layer that a LAZ file announces,
-and ends the process where there is not enough.
+states, even four billion empty ones, and lazrs allocates memory for every chunk and layer that a LAZ file declares,
+and ends the process if there is not enough.
 
 Format: ASPRS, "LAS Specification 1.4 R15"; Isenburg, "LASzip: lossless compression of LiDAR data", 2013.
 """
@@ -34,33 +34,33 @@ if TYPE_CHECKING:
 
 SIGNATURE = b"LASF"
 POINTS_PER_CHUNK = 1_000_000
-"""Read at once, so that memory follows the points in the file and not those that its header promises."""
+"""Read at once, so that memory use depends on the points in the file, not on the count in its header."""
 UNLABELLED = 1
-"""Class "processed, but unclassified"; labels beyond the last free class have it too."""
+"""Class "processed, but unclassified"; also used for labels beyond the last free class."""
 FIRST_FREE_CLASS, LAST_CLASS = 64, 255
 """Classes that the format leaves to its users: label k is class 64 + k."""
 STEPS_PER_EXTENT = 1e8
-"""Coordinates are stored as 32-bit counts of a step: ten nanometers in a room, 10 micrometers in a city block."""
+"""Coordinates are stored as 32-bit multiples of a step: ten nanometers in a room, 10 micrometers in a city block."""
 SCALE_8_TO_16_BITS = 257
-"""An 8-bit color times this spans 16 bits."""
+"""Scales an 8-bit color to the range of 16 bits."""
 EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
-"""Point formats before LAS 1.4 have 32 classes only: for each, the later format that holds all that it does."""
+"""Point formats before LAS 1.4 have only 32 classes: each is mapped to the later format that has all its fields."""
 DEGREES_PER_STEP = 0.006
-"""Unit of scan angles since LAS 1.4; before, whole degrees."""
+"""Unit of scan angles since LAS 1.4; earlier versions store whole degrees."""
 OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 MAX_RECORD_BYTES = 65_535
 MIN_HEADER_BYTES, RECORD_HEADER, LAST_RECORD_HEADER = 227, 54, 60
-"""Bytes of the header of LAS 1.0 to 1.2, and of that of each variable length record, before and behind the points."""
+"""Bytes: the header of LAS 1.0 to 1.2; the header of a variable length record before the points, and after them."""
 LAYERED = 3
-"""LASzip's compressor whose chunks hold each field as a layer of its own."""
+"""LASzip's compressor whose chunks hold each field in a separate layer."""
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of an item by its type; extra bytes, type 14, have one each."""
+"""Number of layers by type of item; extra bytes, type 14, have one layer per byte."""
 EXTRA_BYTES = 14
 
 
 def read_las(path: StrPath) -> Points:
-    """Positions, and colors where the point format has some.
+    """Positions, and colors where the point format has them.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
@@ -68,7 +68,7 @@ def read_las(path: StrPath) -> Points:
     rgb: list[NDArray[np.uint16]] = []
     with _opened(Path(path)) as reader:
         promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
-        if not (scales > 0).all():  # 0 puts all points in one place, a negative scale mirrors them
+        if not (scales > 0).all():  # 0 puts all points in one place; a negative scale mirrors them
             raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
         has_colors = "red" in reader.header.point_format.dimension_names
         for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
@@ -93,14 +93,14 @@ def write_las(
 ) -> None:
     """Write a labelled cloud, compressed where the path ends in .laz; whole or not at all.
 
-    xyz_world: (n, 3); kept to a hundred-millionth of the cloud's extent, whatever its offset. rgb: (n, 3) uint8.
-    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8: as they are in extra
+    xyz_world: (n, 3); precise to a hundred-millionth of the cloud's extent, whatever its offset. rgb: (n, 3) uint8.
+    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8: unchanged in extra
         bytes; og_label + 64 also as the classification, 1 without a label or beyond 255; og_reason also as user data.
-    names: what og_label counts; JSON, in a record.
-    source: the file that the points are of, in its order. If it is LAS, places, colors, intensity, returns, times, its
-        own extra bytes and its coordinate system stay as they are, and so do user data and the classes of points
-        without a label (of those that an earlier run labelled: 1).
-    SceneError where a coordinate is not finite, the names are too long or the source has another number of points;
+    names: those that og_label indexes; stored as JSON in a record.
+    source: the file that the points come from, in its order. If it is LAS, positions, colors, intensity, returns,
+        times, other extra bytes and the coordinate system are kept, and so are user data and the classes of points
+        without a label (1 for those that an earlier run labelled).
+    SceneError where a coordinate is not finite, the names are too long or the source differs in its number of points;
     MissingExtraError without laspy.
     """
     path = Path(path)
@@ -113,7 +113,7 @@ def write_las(
                 las.write(file, do_compress=path.suffix == ".laz")
             except OSError:
                 raise
-            except Exception as error:  # a full disk, as lazrs has it
+            except Exception as error:  # such as lazrs's error for a full disk
                 raise SceneError(f"it cannot be written ({error!s:.120}): is there room?") from error
 
 
@@ -136,17 +136,17 @@ def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArra
 
 
 def _points_of(source: Path, count: int) -> LasData:
-    """A file's points as a point format whose classes have 8 bits, without labels that an earlier run put there."""
+    """A file's points in a point format with 8-bit classes, without the labels of an earlier run."""
     with _opened(source) as reader:
         las = reader.read()
         if len(las.points) != count:
             raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
     degrees = getattr(las, "scan_angle_rank", None)
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
-    if degrees is not None:  # laspy leaves it out, as it has another name and unit now
+    if degrees is not None:  # laspy drops it: its name and unit differ in the new format
         las.scan_angle = np.rint(np.asarray(degrees) / DEGREES_PER_STEP).astype(np.int16)
     own = [name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS]
-    if "og_label" in own:  # an earlier run's class would be taken for one of the new labels
+    if "og_label" in own:  # an earlier run's classes would pass for new labels
         las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
     las.remove_extra_dims(own)
     for records in (las.vlrs, las.evlrs or []):  # COPC's records locate its chunks, which now lie elsewhere
@@ -156,17 +156,17 @@ def _points_of(source: Path, count: int) -> LasData:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A laspy reader of a file whose counts fit it. SceneError, beginning with the path, for what cannot be read."""
+    """A laspy reader of a file whose counts fit its size. SceneError, beginning with the path, if it cannot be read."""
     laspy = _laspy()
     with naming(path):
         try:
             _check_counts(path)
-            # Of laspy's two backends this one takes no memory for points that a chunk only claims to have.
+            # Of laspy's two backends, this one allocates no memory for points that a chunk declares but does not have.
             with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
                 yield reader
         except (SceneError, OSError, KeyboardInterrupt, SystemExit):
             raise
-        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
+        except BaseException as error:  # laspy has its own types; a panic of lazrs is not an Exception
             raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
 
 
@@ -193,11 +193,11 @@ def _laspy() -> Any:
 
 
 def _check_counts(path: Path) -> None:
-    """SceneError where the records, points, chunks or layers that a file announces would not fit into it."""
+    """SceneError where the records, points, chunks or layers that a file declares would not fit into it."""
     size = path.stat().st_size
     _require(size >= MIN_HEADER_BYTES, f"a file of {size} bytes has no whole header")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        # Before laspy parses the header: it reads as many records as this says.
+        # Before laspy parses the header: it reads as many records as this states.
         header_size, first_point, records, _, point_size = struct.unpack_from("<HIIBH", data, 94)
         _require(header_size + RECORD_HEADER * records <= first_point <= size, f"{records} records before the points")
         header = _laspy().LasHeader.read_from(file)
@@ -216,7 +216,7 @@ def _require(fits: bool, what: str) -> None:
 
 def _layers(laszip_records: Sequence[Any]) -> int:
     """Number of layers of a point, 0 where the points are not layered. The LASzip record: the compressor (uint16), 30
-    bytes of versions and sizes, the number of items (uint16), and of each item its type, size and version."""
+    bytes of versions and sizes, the number of items (uint16), and the type, size and version of each item."""
     _require(bool(laszip_records), "compressed points without a LASzip record")
     content = laszip_records[0].record_data
     _require(len(content) >= 34, f"a LASzip record of {len(content)} bytes")
@@ -228,7 +228,7 @@ def _layers(laszip_records: Sequence[Any]) -> int:
 
 
 def _check_last_records(data: mmap.mmap, at: int, records: int) -> None:
-    """The records behind the points, each of a header that holds its length, lie within the file."""
+    """Check that the records after the points, whose headers state their lengths, lie within the file."""
     for record in range(records):
         length = struct.unpack_from("<Q", data, at + 20)[0] if at + LAST_RECORD_HEADER <= len(data) else 0
         at += LAST_RECORD_HEADER + length
@@ -236,14 +236,14 @@ def _check_last_records(data: mmap.mmap, at: int, records: int) -> None:
 
 
 def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: int) -> None:
-    """SceneError where chunks reach beyond the file. First comes the place of their table, then the chunks, one behind
-    the other, then the table, which says how many there are.
+    """SceneError where chunks reach beyond the file. First comes the offset of their table, then the chunks in
+    sequence, then the table, which states their number.
 
     A layered chunk holds its first point, its number of points, the lengths of its layers, and the layers.
     """
     _require(first_point + 8 <= len(data), "a chunk table beyond the end")
     table, at, chunks = struct.unpack_from("<q", data, first_point)[0], first_point + 8, 0
-    if table == -1:  # written to a stream: its place stands at the end
+    if table == -1:  # written to a stream: the offset is at the end of the file
         table = struct.unpack_from("<q", data, len(data) - 8)[0]
     _require(at <= table <= len(data) - 8, f"a chunk table at byte {table} of {len(data)}")
     while layers and at < table:
@@ -252,23 +252,22 @@ def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: in
         at = sizes + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, sizes))
         _require(at <= table, f"layers of chunk {chunks} beyond the chunk table")
         chunks += 1
-    # Chunks without layers do not say how long they are: there are no more than bytes.
+    # Chunks without layers do not state their length: there is at most one per byte.
     counted = struct.unpack_from("<I", data, table + 4)[0]
     _require(counted == chunks if layers else counted <= table - at, f"a table of {counted} chunks")
 
 
 def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Colors span 16 bits, but many writers leave them at 8."""
+    """Colors should span 16 bits, but many writers leave them at 8."""
     return (rgb if rgb.max(initial=0) <= 255 else np.rint(rgb / SCALE_8_TO_16_BITS)).astype(np.uint8)
 
 
 def _grid(xyz_world: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
-    """Offset and step, a power of ten, of the counts that stand for coordinates: at most 10^9 of them, which fit 32
-    bits."""
+    """Offset and step, a power of ten, of integer coordinates: at most 10^9 steps, which fit 32 bits."""
     if not len(xyz_world):
         return np.zeros(3), np.full(3, 1e-3)
     widest = float(np.ptp(xyz_world, axis=0).max())
-    # Whole units, or of a small cloud whole parts of one: else most counts would go to the way from the offset to it.
+    # A whole unit, or a decimal part of one for a small cloud: else most steps would lie between offset and cloud.
     unit = 10.0 ** min(0.0, np.floor(np.log10(widest))) if widest > 0 else 1.0
     offset = np.floor(xyz_world.min(axis=0) / unit) * unit
     extent = max(float((xyz_world - offset).max()), unit)

@@ -1,11 +1,11 @@
-"""Where a ray meets the image, for every camera model that is read: rays of the camera -> normalized coordinates.
+"""Project rays of the camera to normalized image coordinates, for every supported camera model.
 
 Normalized coordinates times the focal lengths plus the principal point are pixels, so they do not change with the
 image's size. x right, y down, z forward; theta is a ray's angle from the axis.
 
-perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``r8``: of r^8 beside k3's r^6, which photogrammetry calls k4.
-             ``xi``: the ray's length times xi is added to z before (unified model of Mei and Rives, ICRA 2007:
-             KITTI-360's fisheyes).
+perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``r8``: coefficient of r^8 (k3 has r^6), which photogrammetry
+             calls k4. ``xi``: the ray's length times xi is first added to z (unified model of Mei and Rives, ICRA
+             2007: KITTI-360's fisheyes).
 fisheye      radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8): Kannala and Brandt, OpenCV's fisheye;
              p1, p2 and the thin prism's sx1, sy1 as in COLMAP's THIN_PRISM_FISHEYE.
 fov          radius atan(2 r tan(omega / 2)) / omega, r = tan(theta): Devernay and Faugeras 2001.
@@ -40,7 +40,7 @@ def _perspective(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tu
 
 
 def _fisheye(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
-    # (x, y) to the length theta; on the axis both are 0, whatever the scale.
+    # Scale (x, y) to length theta; on the axis both are 0, whatever the scale.
     radius = np.hypot(x, y)
     scale = np.arctan2(radius, z) / np.maximum(radius, np.finfo(np.float64).tiny)
     x, y = x * scale, y * scale
@@ -63,14 +63,14 @@ def _tangential(
 
 def _fov(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     radius = np.hypot(x, y)
-    bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]  # arctan2: rays to the side and behind too
+    bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]  # arctan2: also rays to the side and behind
     scale = bent / np.maximum(radius, np.finfo(np.float64).tiny)
     return x * scale, y * scale
 
 
 def _division(x: DoubleArray, y: DoubleArray, z: DoubleArray, t: Terms) -> tuple[DoubleArray, DoubleArray]:
     x, y = x / z, y / z
-    # r = d / (1 + k d^2) solved for d, the root that is r for k = 0; in this form it holds there, too.
+    # r = d / (1 + k d^2) solved for d, the root that is r for k = 0; this form also holds at k = 0.
     scale = 2 / (1 + np.sqrt(1 - 4 * t["k"] * (x * x + y * y)))
     return x * scale, y * scale
 
@@ -93,7 +93,7 @@ MODELS: dict[str, tuple[tuple[str, ...], Projection]] = {
     "extended": (("alpha", "beta"), _extended),
     "spherical": ((), _spherical),
 }
-"""Names of the terms, and the projection."""
+"""Names of the terms, and the projection function."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Lens:
 
     @property
     def wraps(self) -> bool:
-        """Whether the image's left border continues at the right."""
+        """Whether the image continues from its left border at the right one."""
         return self.model == "spherical"
 
     def project(self, rays: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
@@ -132,8 +132,8 @@ SPHERICAL = Lens("spherical", ())
 
 @lru_cache(maxsize=64)
 def widest(lens: Lens) -> float:
-    """The angle from the axis, radians, up to which a lens sees: where radii stop growing. Beyond, a polynomial turns
-    back and would show the inside of the image again; and a perspective lens has no rays to the side or behind."""
+    """The angle from the axis, radians, up to which a lens sees: where radii stop growing. Beyond that, a polynomial
+    turns back and would show the inside of the image again; a perspective lens has no rays to the side or behind."""
     if lens.wraps:
         return np.inf
     with np.errstate(all="ignore"):
@@ -145,7 +145,7 @@ def widest(lens: Lens) -> float:
 def lens_of(model: str, values: Terms) -> Lens | None:
     """The lens with these named terms (absent ones are zero); None if it is a pinhole. SceneError for other terms.
 
-    A fisheye lens with zero terms is equidistant, not a pinhole, so it always is a lens.
+    A fisheye lens with zero terms is equidistant, not a pinhole, so it is never None.
     """
     names, _ = MODELS[model]
     unknown = [name for name, value in values.items() if value and name not in names]
@@ -166,7 +166,7 @@ def lens_of(model: str, values: Terms) -> Lens | None:
 
 
 def spherical_camera(width: int, height: int, world_to_camera: DoubleArray) -> Camera:
-    """The camera of an equirectangular image, all of the sphere: its focal lengths are pixels a radian."""
+    """The camera of an equirectangular image of the whole sphere: its focal lengths are pixels per radian."""
     if not 1.9 < width / max(height, 1) < 2.1:
         raise SceneError(
             f"an equirectangular image is {width}x{height}; expected twice as wide as high, all of the sphere: pad it "

@@ -1,10 +1,10 @@
 """The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
 
-A mask image is gray, 8 or 16 bit, or has a palette, whose colors say nothing. It holds 0 outside every mask, else an id
-1..M, which means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type, where
-row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero image
-and an empty (0, D) array. For masks that a tracker followed it holds ``<view name>.tracks`` -> (M,) whole numbers: the
-same number in all views for what the tracker took for one thing, -1 unknown.
+A mask image is gray, 8 or 16 bit, or has a palette, whose colors are ignored. It holds 0 outside every mask, else an id
+1..M, valid in this image only. The features file holds ``<view name>`` -> (M, D), any float type, where row i belongs
+to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero image and an empty
+(0, D) array. For tracked masks it holds ``<view name>.tracks`` -> (M,) integers: one number per tracked thing, the same
+in all views, -1 unknown.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from og_pointcloud.scene import NOT_SEEN, CutMasks, FloatArray, IntArray
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
 MADE_NAME = "made.json"
-"""The record, in the folder of masks, of the run of `og-pointcloud masks` that made them."""
+"""The record of the run of `og-pointcloud masks` that made the masks, in their folder."""
 TRACKS = ".tracks"
 MAX_FEATURE_BYTES = 1 << 32
 GRAY, PALETTE = 0, 3
@@ -40,8 +40,8 @@ class MaskLayer:
     """One view's masks, before they are paired with a camera.
 
     size: (width, height) of the mask map. features: (M, D) float32. tracks: as `View.mask_tracks`.
-    read: gives the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
-    cut_from: as of `View`.
+    read: returns the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
+    cut_from: as in `View`.
     """
 
     size: tuple[int, int]
@@ -54,7 +54,7 @@ class MaskLayer:
 def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], str]:
     """The masks of these views and the name of their feature space (``unknown`` where the file names none).
 
-    Features are read, of the images only the headers; each image is decoded when its layer's ``read`` is called. Raises
+    Features and image headers are read; each image is decoded when its layer's ``read`` is called. Raises
     SceneError where a view has no mask image or no features, or an image is not gray.
     """
     files = [capture / MASKS_FOLDER / f"{name}.png" for name in names]
@@ -72,12 +72,12 @@ def made_of_some(capture: Path) -> bool:
     """Whether the record beside a capture's masks says that they were made for every n-th image only."""
     try:
         return read_json_object(capture / MASKS_FOLDER / MADE_NAME).get("every", 1) != 1
-    except SceneError:  # masks of others have none
+    except SceneError:  # masks made by other tools have none
         return False
 
 
 def require_all(files: Sequence[Path], cure: str) -> None:
-    """Raise one SceneError for all mask files that are missing: how many, the first three, and the cure."""
+    """Raise one SceneError for all missing mask files: their number, the first three, and the cure."""
     missing = [file for file in files if not file.is_file()]
     if missing:  # one error for all: a capture may lack hundreds
         folder = missing[0].parents[0]
@@ -101,8 +101,8 @@ def _id_header(file: Path) -> PngHeader:
 
 
 def read_ids(file: Path) -> IntArray:
-    """A mask image, (H, W) int32: -1 outside every mask, else the row of the features (the stored id less 1)."""
-    has_palette = _id_header(file).color_type == PALETTE  # OpenCV would give colors instead of ids
+    """A mask image, (H, W) int32: -1 outside every mask, else the feature row (the stored id less 1)."""
+    has_palette = _id_header(file).color_type == PALETTE  # OpenCV would return colors instead of ids
     ids = palette_indices(file) if has_palette else decoded(file, require_cv2().IMREAD_UNCHANGED)
     if ids.ndim != 2:
         raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")
@@ -110,7 +110,7 @@ def read_ids(file: Path) -> IntArray:
 
 
 def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]], str]:
-    """Features and tracks by view name, and the name of the features' space."""
+    """Features and tracks by view name, and the name of the feature space."""
     of_tracks = {name + TRACKS: name for name in names}
     expected = "an array (masks, D) under each image's stem"
     arrays = read_npz(file, names, [*of_tracks, "feature_space"], MAX_FEATURE_BYTES, expected)
@@ -120,8 +120,8 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, FloatArr
 
 
 def rows_shown(ids: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
-    """(u,) the rows of ``count`` features that an id map shows, ascending; and (count + 2,) the place of each row among
-    these, to be indexed by ids: -1 for unused rows; ids -1 and NOT_SEEN, the last two entries, map to themselves."""
+    """(u,) the rows of ``count`` features that an id map shows, ascending; and (count + 2,) the position of each row
+    among these, indexed by ids: -1 for unused rows; ids -1 and NOT_SEEN, the last two entries, map to themselves."""
     used = np.flatnonzero(np.bincount(ids[ids >= 0], minlength=1))
     place = np.full(count + 2, -1, np.int32)
     place[NOT_SEEN] = NOT_SEEN
@@ -130,7 +130,7 @@ def rows_shown(ids: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
 
 
 def as_features(values: NDArray[Any], source: str) -> FloatArray:
-    """(masks, width) float32 of what a file holds. Values beyond float32 become infinite, which the scene reports by
+    """(masks, width) float32 features from a file. Values beyond float32 become infinite, which the scene reports by
     mask. SceneError, which begins with ``source``, for anything but floats of that shape."""
     if values.size == 0:
         return np.zeros((0, values.shape[-1] if values.ndim == 2 else 0), np.float32)

@@ -1,12 +1,12 @@
 """``transforms.json`` of nerfstudio, instant-ngp and Blender: camera-to-world, OpenGL axes (x right, y up, z back).
 
-Intrinsics stand at the top or in a frame, which then overrides the top: ``fl_x fl_y cx cy w h`` in pixels, or
+Intrinsics are at the top level or in a frame, which overrides it: ``fl_x fl_y cx cy w h`` in pixels, or
 ``camera_angle_x`` (radians over the width), with the principal point in the middle unless given. Of the splits that
-Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like concern the
-rendering box of instant-ngp and not the poses; they are ignored.
+Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like describe the
+rendering box of instant-ngp, not the poses, and are ignored.
 
-A frame's ``depth_file_path`` names its depth image inside the capture folder; a stored whole number is a millimeter
-unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` says what it is.
+A frame's ``depth_file_path`` names its depth image inside the capture folder; stored integers are millimeters
+unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` gives another unit.
 
 ``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to
 ``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``.
@@ -39,7 +39,7 @@ LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) -> PosedFrames:
-    """Read a transforms file; ``image_size(path)`` gives (width, height) where it states none (Blender).
+    """Read a transforms file; ``image_size(path)`` returns (width, height) for files without it (Blender).
 
     Raises SceneError for anything that is not such a file, naming the frame and the key.
     """
@@ -58,7 +58,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         path = path.replace("\\", "/")
         with naming(f"{file}, frame '{path:.80}'"):
             camera_to_world = _matrix(frame, "transform_matrix")
-            if np.isfinite(camera_to_world).all():  # trackers write NaN where they were lost
+            if np.isfinite(camera_to_world).all():  # trackers write NaN when they get lost
                 keys = {**shared, **frame}
                 camera = _camera(keys, inverse(camera_to_world * OPENGL_SIGNS), partial(image_size, path))
                 lens = _lens(keys)
@@ -95,10 +95,10 @@ def _camera(
 ) -> Camera:
     w, h, cx, cy = (_number(keys, key) for key in ("w", "h", "cx", "cy"))
     width, height = image_size() if w is None or h is None else (round(w), round(h))
-    if _camera_model(keys) in SPHERICAL_MODELS:  # whatever fl_x says: writers disagree on what it is of a sphere
+    if _camera_model(keys) in SPHERICAL_MODELS:  # fl_x is ignored: writers disagree on its meaning for a sphere
         return spherical_camera(width, height, world_to_camera)
     fx = _focal(keys, "x", width)
-    fy = _focal(keys, "y", height)  # Blender states the angle over the width alone: pixels are square then
+    fy = _focal(keys, "y", height)  # Blender states only the angle over the width: pixels are then square
     if fx is None:
         raise SceneError("neither fl_x (pixels) nor camera_angle_x (radians) is given; expected one of them")
     return Camera(
@@ -151,7 +151,7 @@ def _camera_model(keys: dict[str, Any]) -> str:
 
 
 def _lens(keys: dict[str, Any]) -> Lens | None:
-    """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all terms given count."""
+    """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all given terms count."""
     model = _camera_model(keys)
     other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # other lenses of instant-ngp
     known = PERSPECTIVE_MODELS + FISHEYE_MODELS + SPHERICAL_MODELS

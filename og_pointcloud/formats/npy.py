@@ -1,4 +1,4 @@
-"""The bytes of a .npy file -> array, without a copy, and without believing its header; and back."""
+"""The bytes of a .npy file -> array, without a copy and without trusting its header; and back."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
 MAX_HEADER_BYTES = 1 << 17
-"""Bytes in which a header must end; numpy reads none of more than 10,000 characters."""
+"""Bytes within which a header must end; numpy refuses headers of more than 10,000 characters."""
 LAST_CODE_POINT = 0x10FFFF
 """The last code point of Unicode."""
 MAX_RATIO, ALWAYS_ALLOWED_BYTES = 200, 1 << 26
-"""A file may unpack to this many times its size, or to this many bytes. Vectors hardly shrink, masks by 100."""
+"""A file may unpack to this many times its size, or to this many bytes. Vectors hardly compress, masks by 100."""
 
 
 def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
-    """A read-only array that lies in ``data``; ValueError where it is no .npy, holds objects, or differs in length."""
+    """A read-only array backed by ``data``; ValueError if it is not a .npy, holds objects, or differs in length."""
     stream = io.BytesIO(data[:MAX_HEADER_BYTES])
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran_order, dtype = read(stream)
-        shape = tuple(map(int, shape))  # numpy takes True for an int, until it counts bytes
-    except (ValueError, SyntaxError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own
+        shape = tuple(map(int, shape))  # numpy accepts True as an int until it counts bytes
+    except (ValueError, SyntaxError, tokenize.TokenError, TypeError, RecursionError) as error:  # from its parser
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
         raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")
@@ -43,7 +43,7 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
     if claimed == 0:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
-    # Otherwise an error would come later, without the file's name, where numpy makes strings of the numbers.
+    # Otherwise numpy would raise an error later, without the file's name, when it makes strings of the numbers.
     if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CODE_POINT).any():
         raise ValueError(f"it holds {dtype} text of characters that there are not")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
@@ -52,7 +52,7 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
 def mapped_array(file: Path) -> NDArray[Any]:
     """The array of a .npy file, memory-mapped, so that only used parts are read. SceneError where it cannot be read.
 
-    Not by numpy.load, which divides by zero, and with it ends the process, where a type has no bytes.
+    numpy.load is not used: for a type without bytes it divides by zero, which ends the process.
     """
     try:
         with file.open("rb") as stream:
@@ -73,13 +73,13 @@ def read_npz(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz that are needed, and the optional ones that it has, by name; a name may end in .npy itself.
 
-    An error of this kind, which begins with the file, where it is none, lacks what is ``expected``, unpacks to more
-    than ``max_bytes``, is packed as numpy packs none, or claims to end beyond the file. Nothing is unpickled, and
-    nothing is unpacked before its size is checked.
+    An error of this kind, which begins with the file, if it is not an .npz, lacks what is ``expected``, unpacks to
+    more than ``max_bytes``, uses a compression that numpy does not, or claims to end beyond the file. Nothing is
+    unpickled, and nothing is unpacked before its size is checked.
     """
     try:
         with zipfile.ZipFile(file) as archive:
-            # numpy.savez appends .npy to names, to one that ends so too.
+            # numpy.savez appends .npy to every name, even to one that ends in it.
             held = {info.filename.removesuffix(".npy").removesuffix(".npy"): info for info in archive.infolist()}
             if (total := sum(info.file_size for info in held.values())) > max_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {max_bytes}")

@@ -1,4 +1,4 @@
-"""PCD in: version 0.7, the data ascii, binary or binary_compressed, as one structured array.
+"""Read PCD version 0.7, with ascii, binary or binary_compressed data, as one structured array.
 
 Format: the Point Cloud Library's page "The PCD (Point Cloud Data) file format"; compressed data is Marc Lehmann's LZF.
 """
@@ -19,7 +19,7 @@ from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_row
 
 HEADER_LIMIT = 1 << 16
 POINT_SIZE_LIMIT = 1 << 20
-"""Bytes of a point, descriptors and padding included; the largest of PCL's own types has about 8 kB."""
+"""Bytes of a point, descriptors and padding included; the largest type in PCL has about 8 kB."""
 
 NUMPY_KINDS = {"F": "f", "I": "i", "U": "u"}
 SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -35,16 +35,16 @@ class _Header:
 
 
 def looks_like_pcd(head: bytes) -> bool:
-    """Whether the first bytes of a file are a PCD header: comments, then VERSION, or FIELDS where that is left out."""
+    """Whether the first bytes of a file are a PCD header: comments, then VERSION, or FIELDS if there is no VERSION."""
     return re.match(rb"(?:\s|#[^\n]*\n)*(?:VERSION|FIELDS)[ \t]", head) is not None
 
 
 def read_pcd(path: StrPath) -> NDArray[np.void]:
     """(points,) structured array, one field per FIELDS entry (a sub-array where COUNT > 1), little endian.
 
-    Padding fields, all called ``_`` in the file, become ``_0``, ``_1``. The VIEWPOINT (where the sensor stood) is not
-    applied: points are taken in the frame in which they are written, as PCL and Open3D do. SceneError, beginning with
-    the path, for a file that is missing, foreign, truncated, damaged, or whose header does not fit its size.
+    Padding fields, all called ``_`` in the file, become ``_0``, ``_1``. The VIEWPOINT (pose of the sensor) is not
+    applied: points stay in the frame in which they are stored, as in PCL and Open3D. SceneError, beginning with the
+    path, for a file that is missing, truncated, damaged, of another format, or whose header does not fit its size.
     """
     path = Path(path)
     with naming(path), path.open("rb") as file:
@@ -66,7 +66,7 @@ def _parse_header(head: bytes) -> _Header:
     encoding = last_line[1].decode("ascii", "replace")
     if encoding not in ENCODINGS:
         raise SceneError(f"PCD data is {encoding!r:.40}; expected one of {', '.join(ENCODINGS)}")
-    # The header is a line a keyword, in any order, up to DATA.
+    # The header has one line per keyword, in any order, and ends with DATA.
     entries: dict[str, list[str]] = {}
     for line in head[: last_line.start()].decode("utf-8", "replace").split("\n"):
         keyword, *values = line.split() or ["#"]  # blank lines count as comments
@@ -86,7 +86,7 @@ def _dtype(entries: dict[str, list[str]]) -> np.dtype:
     names = [f"_{i}" if name == "_" else name for i, name in enumerate(entries.get("FIELDS", []))]
     if not names or len(set(names)) < len(names):
         raise SceneError(f"PCD FIELDS are {' '.join(names)[:80]!r}; expected at least one name, each once")
-    # COUNT may be left out; it is 1 for all then.
+    # COUNT may be left out; it is then 1 for all fields.
     sizes = _whole_numbers(entries, "SIZE", len(names))
     counts = _whole_numbers(entries, "COUNT", len(names)) if "COUNT" in entries else [1] * len(names)
     types = entries.get("TYPE", [])
@@ -117,8 +117,8 @@ def _whole_numbers(entries: dict[str, list[str]], keyword: str, expected: int) -
 
 
 def _read_compressed(file: BinaryIO, header: _Header) -> NDArray[np.void]:
-    """Two sizes, packed and unpacked, then the packed data. Unpacked it is column by column: all values of the first
-    field, then all of the second."""
+    """Two sizes, packed and unpacked, then the packed data. The unpacked data is stored by column: all values of the
+    first field, then all of the second."""
     sizes = read_binary_rows(file, np.dtype("<u4"), 2, "sizes of the compressed PCD data")
     compressed_size, size = sizes.tolist()
     compressed = read_binary_rows(file, np.dtype("u1"), compressed_size, "compressed PCD data").tobytes()
@@ -140,10 +140,12 @@ def _read_compressed(file: BinaryIO, header: _Header) -> NDArray[np.void]:
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytearray:
-    """LZF: a control byte below 32 announces that many literal bytes plus one; any other a copy of earlier output.
+    """LZF: a control byte below 32 is the number of literal bytes that follow, less one; any other starts a copy of
+    earlier output.
 
-    Of a copy's control byte, the upper three bits hold its length less two (for 7, the next byte is added), the lower
-    five and one more byte how far back it starts, less one. A copy may overlap its own output, which repeats a pattern.
+    The upper three bits of a copy's control byte hold its length less two (if they are 7, the next byte is added); the
+    lower five and one more byte hold how far back it starts, less one. A copy may overlap its own output, which repeats
+    a pattern.
     """
     out = bytearray()
     at = 0
@@ -156,7 +158,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytearray:
                 at += control + 1
                 continue
             length = (control >> 5) + 2
-            if length == 9:  # 7 + 2: longer than three bits say
+            if length == 9:  # 7 + 2: longer than three bits can hold
                 length += data[at]
                 at += 1
             distance = ((control & 31) << 8 | data[at]) + 1
@@ -166,7 +168,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytearray:
                 raise SceneError("the compressed PCD data points before its beginning: the file is damaged")
             if distance >= length:
                 out += out[start : start + length]
-            else:  # it runs into what it writes: the last bytes, again and again
+            else:  # it overlaps its own output: repeat the last bytes
                 out += (out[start:] * (length // distance + 1))[:length]
     except IndexError:
         raise SceneError("the compressed PCD data ends within a copy: the file is damaged") from None

@@ -1,16 +1,16 @@
-"""What phones record: Polycam's raw data, 3D Scanner App's "all data", Apple's ARKitScenes.
+"""Recordings of phones: Polycam's raw data, 3D Scanner App's "all data", Apple's ARKitScenes.
 
-Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_cameras`` (``cameras``): a JSON an
+Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_cameras`` (``cameras``): a JSON per
                 image, ``fx fy cx cy width height`` and ``t_00`` ... ``t_23``, camera to world, ARKit's axes (y up, z
                 back); ``depth`` of 256 x 192, millimeters.
 3D Scanner App  ``frame_00000.jpg`` with ``frame_00000.json``: ``cameraPoseARFrame``, 16 numbers row by row, and
                 ``intrinsics``, 9 numbers; ``depth_00000.png``, millimeters. Most poses have no image.
 ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_wide_intrinsics/*.pincam`` (width height
                 fx fy cx cy) and ``lowres_wide.traj``: time, rotation vector, translation, world to camera, OpenCV's
-                axes. An image takes the pose whose time is nearest, if that is within 10 ms.
+                axes. An image gets the pose nearest in time, if within 10 ms.
 
-Image and depth image have different sizes and one lens. Worlds are in meters and stay as they are, so that clouds which
-the apps export (y up) fit. Images are as the sensor gave them, in landscape, however the phone was held.
+Image and depth image differ in size but share a lens. Worlds are in meters and kept as they are, so that clouds
+exported by the apps (y up) fit. Images are in the sensor's landscape orientation, however the phone was held.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 MAX_OFFSET_S = 0.01
-"""Between an image and its pose."""
+"""Largest time between an image and its pose."""
 
 
 def _sensor(width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Sensor:

@@ -1,14 +1,14 @@
-"""Cameras as photogrammetry exports them: Agisoft Metashape's XML, RealityScan's (RealityCapture's) CSV.
+"""Cameras exported by photogrammetry programs: Agisoft Metashape's XML, RealityScan's (RealityCapture's) CSV.
 
 Metashape    File > Export > Export Cameras, Agisoft XML. Poses are camera-to-chunk with OpenCV axes; the transform of
              the chunk, or of the camera's component, takes them to the world (geocentric where the project has
-             coordinates). The principal point counts from the image's middle; its p1 and p2 are OpenCV's p2 and p1, its
-             k4 is of r^8.
-RealityScan  Registration, "Internal/External camera parameters": a line an image, ``#name,x,y,alt,heading,pitch,roll,
-             f,px,py,k1,k2,k3,k4,t1,t2``. At angles of 0 a camera looks down with north on top. Focal length and
-             principal point are millimeters of a frame whose longer side is 36.
+             coordinates). The principal point is relative to the image's middle; p1 and p2 are OpenCV's p2 and p1, k4
+             is the coefficient of r^8.
+RealityScan  Registration, "Internal/External camera parameters": a line per image, ``#name,x,y,alt,heading,pitch,roll,
+             f,px,py,k1,k2,k3,k4,t1,t2``. At angles of 0 a camera looks down with north at the top. Focal length
+             and principal point are in millimeters of a frame whose longer side is 36.
 
-Images are called by name alone; they are looked for in the folder and its image folders.
+Images are given by file name only; they are searched for in the folder and its image folders.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "
 
 
 def find_photogrammetry(capture: Path) -> Path | None:
-    """The export of one of these programs in the folder, known by its first bytes, or None."""
+    """The export of one of these programs in the folder, recognized by its first bytes, or None."""
     files = [*sorted(capture.glob("*.xml")), *sorted(capture.glob("*.csv"))]
     return next((file for file in files if file.is_file() and _reader(file) is not None), None)
 
 
 def read_photogrammetry(file: Path, image_size: ImageSize) -> PosedFrames:
-    """Poses of the export that `find_photogrammetry` found. ``image_size(name)`` gives (width, height) of an image.
+    """Poses of the export that `find_photogrammetry` found. ``image_size(name)`` returns (width, height) of an image.
 
     Images without a pose are dropped. SceneError names the file, the camera and the cure.
     """
@@ -75,14 +75,14 @@ def _reader(file: Path) -> Callable[[str, ImageSize], PosedFrames] | None:
 
 
 def _metashape(text: str, _: ImageSize) -> PosedFrames:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few entities in each other unpack to gigabytes
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few nested entities unpack to gigabytes
         raise SceneError("the XML defines entities; expected none, as Metashape writes it: export it again")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise SceneError(f"not valid XML ({error}): export the cameras again") from None
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled") != "false" and _cameras(chunk)]
-    # A chunk without a transform has a world of its own, which only the one chunk of a file may have.
+    # A chunk without a transform has a world of its own, which is allowed only if the file has one chunk.
     placed = [
         chunk for chunk in chunks if _world_of(chunk) is not None or chunk.find(".//component/transform") is not None
     ]
@@ -98,7 +98,7 @@ def _metashape(text: str, _: ImageSize) -> PosedFrames:
 
 
 def _cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
-    """The enabled cameras of a chunk, those in groups too."""
+    """The enabled cameras of a chunk, including those in groups."""
     return [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled") not in ("false", "0")]
 
 
@@ -113,7 +113,7 @@ def _chunk(chunk: ElementTree.Element) -> tuple[list[PosedImage], list[str]]:
             dropped.append(label)
             continue
         with naming(f"camera '{label:.60}'"):
-            # Cameras that were aligned in several groups lie in components, each with a place of its own in the world.
+            # Cameras that were aligned in several groups lie in components, each with its own transform to the world.
             world = worlds.get(camera.get("component_id")) or world_of_chunk or (1.0, np.eye(3), np.zeros(3))
             images.append(_metashape_image(label, sensor, _floats(transform, 16).reshape(4, 4), world))
     return images, dropped
@@ -137,9 +137,9 @@ def _world_of(element: ElementTree.Element) -> World | None:
 
 def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleArray, world: World) -> PosedImage:
     scale, rotation, translation = world
-    with np.errstate(all="ignore"):  # the camera refuses the result
+    with np.errstate(all="ignore"):  # `Camera` refuses the result
         pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
-    # A sensor may have an initial and an adjusted calibration: poses belong to the adjusted one.
+    # A sensor may have an initial and an adjusted calibration; poses belong to the adjusted one.
     calibrations = sensor.findall("calibration")
     adjusted = next((made for made in calibrations if made.get("class") == "adjusted"), None)
     calibration = adjusted if adjusted is not None else next(iter(calibrations), None)
@@ -213,7 +213,7 @@ def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> It
                 raise SceneError("it names no image; expected #name first: export it again")
             values = _numbers(line)
             width, height = image_size(name)
-            scale = max(width, height) / FULL_FRAME_MM  # pixels a millimeter
+            scale = max(width, height) / FULL_FRAME_MM  # pixels per millimeter
             center = np.array([values["x"], values["y"], values["alt"]])
             pose = rigid(_looking_down(values["heading"], values["pitch"], values["roll"]), center) * OPENGL_SIGNS
             camera = Camera(

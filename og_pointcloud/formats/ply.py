@@ -1,6 +1,7 @@
-"""PLY in and out: ascii and binary, either byte order, as one structured array per element.
+"""Read and write PLY, ascii or binary in either byte order, as one structured array per element.
 
-Format: Greg Turk, "The PLY Polygon File Format", 1994; type names with bit widths (``float32``) as later tools write.
+Format: Greg Turk, "The PLY Polygon File Format", 1994; also type names with bit widths (``float32``), as later tools
+write them.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_rows, storable_positions
 
 HEADER_LIMIT = 1 << 18
-"""Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
+"""Bytes within which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
 
 MAX_PROPERTIES = 1024
 MAX_NAME_LENGTH = 80
-"""Bounds of what a header may declare, far beyond any writer's."""
+"""Bounds on what a header may declare, far above what any writer produces."""
 
 NUMPY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -32,7 +33,7 @@ NUMPY_TYPES = {
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
 PLY_TYPES = {numpy_type: name for name, numpy_type in reversed(NUMPY_TYPES.items())}
-"""The names of 1994, which every reader knows: reversed, the first name of a type is the last one set."""
+"""The names of 1994, which every reader knows: in reverse order, the first name of each type is set last."""
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -41,7 +42,7 @@ class _Element:
     name: str
     count: int
     columns: dict[str, str] = field(default_factory=dict)
-    """Property -> type code of numpy, without a byte order."""
+    """Property -> numpy type code without byte order."""
     has_lists: bool = False
 
     def dtype(self, byte_order: str) -> np.dtype:
@@ -60,14 +61,14 @@ def read_ply(path: StrPath) -> dict[str, NDArray[np.void]]:
     """Element name -> (count,) structured array, one field per property, native byte order.
 
     Elements are read up to the first with a list property (the faces of a mesh, which follow the vertices). SceneError,
-    beginning with the path, for a file that is missing, foreign, truncated, or whose header does not fit its size;
-    nothing is allocated before that check.
+    beginning with the path, for a file that is missing, truncated, of another format, or whose header does not
+    fit its size; nothing is allocated before that check.
     """
     path = Path(path)
     with naming(path), path.open("rb") as file:
         header = _parse_header(file.read(HEADER_LIMIT))
         file.seek(header.data_offset)
-        # Where a row of lists ends is known only once it is read: elements behind one have no place to seek to.
+        # Rows with lists have no fixed length, so elements after them cannot be located without reading them.
         plain = takewhile(lambda element: not element.has_lists, header.elements)
         return {element.name: _rows(file, element, header.byte_order) for element in plain}
 
@@ -76,11 +77,11 @@ def write_ply(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments:
     """Write structured arrays as a binary little-endian PLY, whole or not at all.
 
     elements: name -> (n,) structured array of scalar fields, int8 to int32 or float32, float64. comments: a line each.
-    SceneError where a field has a type that PLY lacks, or the folder cannot be written.
+    SceneError where PLY lacks the type of a field, or the folder cannot be written.
     """
     path = Path(path)
     with naming(path):
-        # All is converted before the file is opened: what PLY cannot hold leaves nothing behind.
+        # Everything is converted before the file is opened: an unsupported type leaves no file behind.
         packed = {name: _packed(name, rows) for name, rows in elements.items()}
         header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
         for name, rows in packed.items():
@@ -95,7 +96,7 @@ def write_ply(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments:
 
 
 def join_columns(columns: Mapping[str, NDArray]) -> NDArray[np.void]:
-    """One-dimensional arrays of one length -> (n,) structured array with a field each, types kept."""
+    """One-dimensional arrays of equal length -> (n,) structured array with one field each, types kept."""
     lengths = {name: column.shape for name, column in columns.items()}
     if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
         raise SceneError(f"columns have shapes {lengths}; expected one-dimensional arrays of one length")
@@ -151,8 +152,8 @@ def _parse_header(head: bytes) -> _Header:
 
 
 def _add_property(element: _Element, words: list[str], number: int) -> None:
-    """Append the property that ``words``, the rest of a header line, declare."""
-    if words[0] == "list" and len(words) == 4:  # its rows have unequal lengths, and are not read
+    """Append the property that ``words``, the rest of a header line, declares."""
+    if words[0] == "list" and len(words) == 4:  # its rows differ in length and are not read
         element.has_lists = True
         return
     if len(words) != 2:
@@ -168,17 +169,17 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
 
 
 def _rows(file: BinaryIO, element: _Element, byte_order: str) -> NDArray[np.void]:
-    """The rows of an element without lists, which begin where the file stands."""
+    """The rows of an element without lists, from the file's current position."""
     what = f"element '{element.name}'"
     if not byte_order:
         return read_text_rows(file, element.dtype("="), element.count, what)
     rows = read_binary_rows(file, element.dtype(byte_order), element.count, what)
-    # To the machine's byte order, in which everything after this computes.
+    # To native byte order, which all later computation expects.
     return rows.astype(rows.dtype.newbyteorder("="), copy=False)
 
 
 def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:
-    """The same rows, little endian and without padding; SceneError for fields of a type that PLY lacks."""
+    """The same rows, little endian and without padding; SceneError where PLY lacks the type of a field."""
     names = rows.dtype.names
     if not names or rows.ndim != 1:
         raise SceneError(f"element '{element}' is {rows.dtype} {rows.shape}; expected a 1-D structured array")

@@ -1,4 +1,4 @@
-"""Geometry files -> Points, told apart by their content; and the labelled cloud that other tools open."""
+"""Read geometry files of any known format, recognized by content, as Points; write labelled PLY for other tools."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from og_pointcloud.scene import Points
 
 
 def read_points(path: StrPath) -> Points:
-    """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.
+    """Read a plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's PLY, SPZ), whatever the name.
 
-    World coordinates are read as float64; their median becomes the origin. Colors come as uint8 RGB, None where the
+    World coordinates are read as float64; their median becomes the origin. Colors are uint8 RGB, None where the
     file has none. Points of a plain cloud that hold NaN or infinity, as depth cameras write them, are left out with a
     warning.
-    SceneError, beginning with the path, for what cannot be read or has no points, and for Gaussians that hold NaN. LAS
-    and LAZ need the extra 'las', E57 'e57', the newest SPZ 'spz'.
+    SceneError, beginning with the path, for a file that cannot be read or has no points, and for Gaussians that hold
+    NaN. LAS and LAZ need the extra 'las', E57 'e57', SPZ version 4 'spz'.
 
     >>> import pathlib, tempfile
     >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
@@ -47,8 +47,8 @@ def read_points(path: StrPath) -> Points:
 
 
 def read_places(path: StrPath) -> NDArray[np.float64]:
-    """(n, 3) float64 world coordinates of every row of such a file, to be labelled: rows with NaN or infinity stay, and
-    a warning says that they stay unknown. A PLY or PCD may have no rows, as an array may."""
+    """(n, 3) float64 world coordinates of every row of a geometry file, to be labelled: rows with NaN or infinity are
+    kept, with a warning that they stay unknown. A PLY or PCD may have no rows, as an array may."""
     path = Path(path)
     with naming(path):
         found = _read(path)
@@ -60,7 +60,7 @@ def read_places(path: StrPath) -> NDArray[np.float64]:
 
 
 def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_]:
-    """(n,) bool, points whose coordinates are finite; a warning where some are not, SceneError where none is."""
+    """(n,) bool, whether each point's coordinates are finite; warns where some are not, SceneError where none are."""
     placed = np.logical_and.reduce(np.isfinite(xyz), axis=1)
     if not placed.any():
         rest = f", and {len(xyz)} that hold NaN or infinity" if len(xyz) else ""
@@ -73,8 +73,8 @@ def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_
 
 
 def _read(path: Path) -> Points | NDArray[np.void]:
-    """A file's points; of a plain cloud in PLY or PCD its rows as they are."""
-    if path.exists() and not (path.is_file() or path.is_dir()):  # it would be read twice
+    """A file's points; for a plain cloud in PLY or PCD, its rows as they are."""
+    if path.exists() and not (path.is_file() or path.is_dir()):  # such a file cannot be read twice
         raise SceneError("it is a pipe or a device; expected a file: write the cloud to one first")
     with path.open("rb") as file:
         head = file.read(4096)  # PCD headers may begin with comments
@@ -111,11 +111,11 @@ def write_labelled_ply(
     attributes: Mapping[str, NDArray],
     names: Sequence[str] = (),
 ) -> None:
-    """Write a cloud with its labels: x y z, red green blue (uchar), and the attributes as they are; atomic.
+    """Write a cloud with its labels: x y z, red green blue (uchar), and the unchanged attributes; whole or not at all.
 
     xyz_world: (n, 3); written as float, or as double where float would move a point by more than 1e-6 of the cloud's
     extent. rgb: (n, 3) uint8. attributes: name -> (n,): og_label, og_instance (int32), og_score (float32), og_reason
-    (uint8). names: what og_label counts; a comment "og_names", JSON, unless they would not fit into a header.
+    (uint8). names: those that og_label indexes; written as JSON in a comment "og_names" if they fit into a header.
     """
     comment = f"og_names {json.dumps(list(names))}"
     fits = names and len(comment) < HEADER_LIMIT // 2

@@ -1,5 +1,5 @@
-"""The common result of all pose files: one record per image, in world coordinates. And what their readers share:
-cameras without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
+"""The common result of all pose files: one record per image, in world coordinates. Also what their readers share:
+cameras without a pose, recordings that lose tracking, numbers in text and JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from og_pointcloud.scene import Camera, DoubleArray
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 MAX_NUMBER = 1e30
-"""Larger numbers in a pose file mean damage. Squares of smaller ones are finite."""
+"""Larger numbers in a pose file mean that it is damaged. Squares of smaller ones are finite."""
 OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 """Factors of a camera-to-world pose's columns, between OpenGL's axes (y up, z back) and OpenCV's."""
 
@@ -36,7 +36,7 @@ class PosedImage:
     path: as written there, with forward slashes; relative to the capture folder or to its image folder.
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
     lens: None for a pinhole. depth: the depth image that the pose file or data set has for it.
-    face: where a view lies in the image; None where the image is the view.
+    face: the view's part of the image; None if the image is the view.
     """
 
     path: str
@@ -48,8 +48,8 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class PosedFrames:
-    """The contents of a pose file or a data set's folder. dropped: paths of images without a finite pose (trackers get
-    lost). ply_file_path: of the cloud that the file names, as written there."""
+    """The contents of a pose file or a data set's folder. dropped: paths of images without a finite pose (lost
+    tracking). ply_file_path: the cloud's path as written in the file."""
 
     images: tuple[PosedImage, ...]
     dropped: tuple[str, ...] = ()
@@ -58,7 +58,7 @@ class PosedFrames:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A pinhole camera without its pose: pixels, pixel centers at +0.5. unit: of depth, as `DepthFile`."""
+    """A pinhole camera without its pose: pixels, pixel centers at +0.5. unit: of depth, as in `DepthFile`."""
 
     size: tuple[int, int]
     fx: float
@@ -69,11 +69,11 @@ class Sensor:
 
     @classmethod
     def from_matrix(cls, size: tuple[int, int], matrix: DoubleArray) -> Sensor:
-        """From intrinsics (3 or 4, 3 or 4) that count pixel centers at whole numbers, as most RGB-D sets do."""
+        """From intrinsics (3 or 4, 3 or 4) with pixel centers at whole numbers, as in most RGB-D data sets."""
         return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
 
     def at(self, camera_to_world: DoubleArray) -> Camera:
-        """The camera there; camera_to_world: (3 or 4, 4), finite, OpenCV axes."""
+        """The camera at a pose; camera_to_world: (3 or 4, 4), finite, OpenCV axes."""
         if camera_to_world.shape not in ((3, 4), (4, 4)):
             raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
         return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, inverse(camera_to_world))
@@ -81,11 +81,11 @@ class Sensor:
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """A frame as a data set's reader finds it.
+    """A frame found by a data set's reader.
 
-    path: of the image, in the capture folder. source: where the pose was read, for errors. pose: camera to world,
-    OpenCV axes; None, or not finite, where tracking was lost. color: the image's sensor; None where nothing is known of
-    it. depth: the depth sensor, and a file that may be absent.
+    path: of the image, in the capture folder. source: where the pose comes from, for errors. pose: camera to world,
+    OpenCV axes; None, or not finite, where tracking was lost. color: the image's sensor; None if unknown.
+    depth: the depth sensor, and a file that may be absent.
     """
 
     path: str
@@ -118,7 +118,7 @@ def in_pinholes(image: PosedImage) -> tuple[PosedImage, ...]:
     """The pinhole views of an image: itself, unless it has a lens."""
     if image.lens is None:
         return (image,)
-    views = faces(image.camera, image.lens)  # depths are along the axis of the first
+    views = faces(image.camera, image.lens)  # depth is measured along the axis of the first
     return tuple(
         replace(image, camera=face.camera, lens=None, depth=None if index else image.depth, face=face)
         for index, face in enumerate(views)
@@ -153,16 +153,16 @@ def rotation_of_quaternion(wxyz: ArrayLike) -> DoubleArray:
 
 
 def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> DoubleArray:
-    """(4, 4) of a quaternion w x y z of any length, and a translation (3,); SceneError where there is no rotation."""
+    """(4, 4) of a quaternion w x y z of any length, and a translation (3,); SceneError if it is no rotation."""
     quaternion, shift = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
     length = math.hypot(*quaternion)
-    if not 1e-8 < length < np.inf or not np.isfinite(shift).all():  # also where it is NaN
+    if not 1e-8 < length < np.inf or not np.isfinite(shift).all():  # also if it is NaN
         raise SceneError(f"the pose {quaternion} {shift} has no rotation; expected a finite quaternion of length 1")
     return rigid(rotation_of_quaternion(quaternion / length), shift)
 
 
 def rotation_of_vector(radians: ArrayLike) -> DoubleArray:
-    """(3, 3) rotation about a vector (3,) by its length; NaN where that is not finite."""
+    """(3, 3) rotation about a vector (3,) by its length; NaN if that is not finite."""
     half = np.asarray(radians, np.float64) / 2
     with np.errstate(over="ignore", invalid="ignore"):
         # The quaternion cos(angle), sin(angle) half / angle; np.sinc(x), sin(pi x) / (pi x), is 1 at an angle of 0.
@@ -173,7 +173,7 @@ def rotation_of_vector(radians: ArrayLike) -> DoubleArray:
 def quaternion_of(rotation: DoubleArray) -> DoubleArray:
     """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    # 4 q q': row i is the quaternion times four times its part i. The row of the largest part divides safely.
+    # 4 q q': row i is the quaternion times four times its component i. The row of the largest one divides safely.
     products = np.array(
         [
             [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
@@ -188,7 +188,7 @@ def quaternion_of(rotation: DoubleArray) -> DoubleArray:
 
 def upright_axes(up: DoubleArray) -> DoubleArray:
     """(3, 3) right-handed orthonormal rows, the third of which is a unit vector up."""
-    # Any direction across up will do; the coordinate axis least along up gives a product far from zero.
+    # Any direction perpendicular to up will do; the coordinate axis least along up gives a product far from zero.
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
     return np.asarray([aside, np.cross(up, aside), up], np.float64)
@@ -197,7 +197,7 @@ def upright_axes(up: DoubleArray) -> DoubleArray:
 def in_local_frame(camera: Camera, origin: DoubleArray) -> Camera:
     """The camera seen from local coordinates, world = local + origin.
 
-    R (local + origin) + t = R local + (R origin + t): in float64, so that an offset of 1e6 costs under 1e-9.
+    R (local + origin) + t = R local + (R origin + t): in float64, so that an offset of 1e6 adds an error under 1e-9.
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     return replace(camera, world_to_camera=rigid(rotation, rotation @ origin + translation))
@@ -209,13 +209,13 @@ def numbered(files: Iterable[Path]) -> list[Path]:
 
 
 def numbered_images(folder: Path) -> list[Path]:
-    """The images in a folder, as `numbered`; none where it is no folder."""
+    """The images in a folder, as `numbered`; none if it is not a folder."""
     found = folder.iterdir() if folder.is_dir() else ()
     return numbered(file for file in found if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file())
 
 
 def the_only(folder: Path, pattern: str, what: str) -> Path | None:
-    """The one file of a folder that fits the pattern, None without any; SceneError, which calls them ``what``, for
+    """The one file of a folder that matches the pattern, None without any; SceneError, which calls them ``what``, for
     several."""
     files = sorted(folder.glob(pattern))
     if len(files) > 1:
@@ -244,19 +244,19 @@ def read_json_object(file: Path) -> dict[str, Any]:
 
 
 def read_text(file: Path, most: int = MAX_TEXT_BYTES) -> str:
-    """A text file of bounded size, in UTF-8; SceneError where it is longer, or no text."""
+    """A text file of bounded size, in UTF-8; SceneError if it is longer, or not text."""
     try:
         if not file.is_file():
             raise SceneError(f"{file} is no file; expected a text file")  # a device or a pipe never ends
         if (size := file.stat().st_size) > most:
             raise SceneError(f"{file} has {size} bytes; expected at most {most}: split it")
-        return file.read_text(encoding="utf-8-sig")  # editors of Windows put a mark before it
+        return file.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark
     except (UnicodeDecodeError, OSError) as error:
         raise SceneError(f"{file} cannot be read as text ({error!s:.80}): export it again") from None
 
 
 def read_numbers(file: Path, columns: int) -> DoubleArray:
-    """(rows, columns) float64 of a text file of numbers, ``nan`` and ``inf`` among them."""
+    """(rows, columns) float64 of a text file of numbers, including ``nan`` and ``inf``."""
     rows = [line.split() for line in read_text(file).splitlines() if line.strip()]
     try:
         numbers = np.array([[float(word) for word in row] for row in rows], np.float64)
@@ -268,7 +268,7 @@ def read_numbers(file: Path, columns: int) -> DoubleArray:
 
 
 def named_numbers(content: Any, keys: Sequence[Any], source: Path | str) -> list[float]:
-    """The values of a JSON object, or list, at these keys; SceneError where one is no finite number."""
+    """The values of a JSON object, or list, at these keys; SceneError where one is not a finite number."""
     try:
         values = [float(content[key]) for key in keys]
     except (TypeError, ValueError, KeyError, IndexError, OverflowError):

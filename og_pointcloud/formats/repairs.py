@@ -3,19 +3,19 @@
 A repair is one word, ``name=value``. Repairs are applied in order to the contents of the pose and mask files; points
 are never touched, so that answers stay in the cloud's frame. ``repairs.json`` in a capture folder lists those that
 every command applies; `og-pointcloud repair` writes it, and the checks of a capture (og_pointcloud.checking) try the
-same table, `KINDS`, to find out what a capture means.
+same table, `KINDS`, to find out which conventions a capture uses.
 
   axes=flipped          the cameras' y and z axes point the other way: OpenCV's where OpenGL's are read, or the reverse
   direction=inverse     poses are world-to-camera where camera-to-world is read, or the reverse
   quaternions=xyzw      quaternions are stored x y z w where w x y z is read
-  world=x,z,-y          the poses' world has other axes: its x, y, z are these of the cloud
-  scale=2.5             the poses' lengths, times this, are the cloud's
+  world=x,z,-y          the poses' world has other axes: its x, y, z are these axes of the cloud
+  scale=2.5             the poses' lengths times this are the cloud's
   aligned=tx,ty,tz,rx,ry,rz,s   cameras moved as a whole: by t, in the cloud's unit, turned by the rotation vector r
                         (degrees) and scaled by s about their mean center
   frames=1              image i has the pose that is listed for image i + 1 (-1: i - 1)
-  intrinsics=2          fx, fy, cx, cy are of an image that is smaller by this factor
+  intrinsics=2          fx, fy, cx, cy belong to an image that is smaller by this factor
   focal=1.5             fx and fy times this
-  center=swapped        cx and cy are in each other's place; center=middle: the image's middle is meant
+  center=swapped        cx and cy are exchanged; center=middle: the image's middle is meant
   shifted=du,dv         cx and cy moved by these shares of width and height
   lens=none             images and masks are free of distortion already
   masks=mirrored        left and right exchanged; upside-down; turned: by 180 degrees
@@ -61,12 +61,12 @@ AXIS_NAMES = tuple(
     for axes in itertools.permutations("xyz")
     for signs in itertools.product(("", "-"), repeat=3)
 )[1:]
-"""All signed axis permutations but the identity; half of them mirror the world."""
+"""All signed axis permutations except the identity; half of them mirror the world."""
 
 
 @dataclass(frozen=True)
 class Repair:
-    """One repair of the list above. numbers: those in its value, if it has some.
+    """One repair of the list above. numbers: those in its value, if any.
 
     >>> str(Repair.parse("scale=2.5")), Repair.parse("scale=2.5").numbers
     ('scale=2.5', (2.5,))
@@ -78,7 +78,7 @@ class Repair:
 
     @classmethod
     def parse(cls, text: str) -> Repair:
-        """SceneError where the text is none of the repairs."""
+        """Parse the text; SceneError if it is none of the repairs."""
         name, _, value = text.partition("=")
         kind = KINDS.get(name)
         if kind is not None and value in kind.words:
@@ -102,10 +102,10 @@ Change = Callable[[list[Camera], Repair], list[Camera]]
 
 @dataclass(frozen=True)
 class Kind:
-    """change: a function of all cameras, which start from world coordinates, in the order of the pose file. words: the
-    values that it can have; or numbers: how many it takes, the last of which must be positive unless may_be_negative.
-    doublings: the checks try a number doubled, and halved, up to so many times; of words they try each. of_all: the
-    change of one camera depends on the others."""
+    """change: a function of all cameras, from world coordinates, in the order of the pose file. words: the allowed
+    values; or numbers: how many it takes, the last of which must be positive unless may_be_negative. doublings: the
+    checks double and halve a number up to this many times; they try every word. of_all: the change of one camera
+    depends on the others."""
 
     change: Change
     words: tuple[str, ...] = ()
@@ -154,7 +154,7 @@ def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
     """The masks after these repairs; layers: in the order of the pose file."""
     repaired = list(layers)
-    # In the order in which they are listed: a shift of images and a flip of each do not depend on each other.
+    # In the order of the list: shifting images and flipping each do not depend on each other.
     for value in (repair.value for repair in repairs if repair.name == "masks"):
         if value in MASK_SHIFTS:
             by = MASK_SHIFTS[value] % len(repaired)
@@ -170,7 +170,7 @@ def _read_repaired(read: Callable[[], IntArray], value: str) -> IntArray:
 
 
 def _numbers(text: str) -> tuple[float, ...]:
-    """The numbers between commas; none where they are not finite numbers."""
+    """The numbers between commas; none if they are not finite numbers."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -178,7 +178,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     return numbers if np.isfinite(numbers).all() else ()
 
 
-# What each does to cameras --------------------------------------------------------------------------------------------
+# Effects on cameras ---------------------------------------------------------------------------------------------------
 
 
 def _each(change: Callable[[Camera, Repair], Camera]) -> Change:
@@ -191,8 +191,8 @@ def _each_pose(change: Callable[[DoubleArray, Repair], DoubleArray]) -> Change:
 
 
 def _with_xyzw(pose: DoubleArray, repair: Repair) -> DoubleArray:
-    """The pose whose quaternion, stored as x y z w, was read as w x y z. It is known from the rotation up to its sign,
-    which does not matter: q and -q are one rotation."""
+    """The pose whose quaternion, stored as x y z w, was read as w x y z. The rotation determines it up to its sign,
+    which does not matter: q and -q are the same rotation."""
     return rigid(rotation_of_quaternion(np.roll(quaternion_of(pose[:3, :3]), 1)), pose[:3, 3])
 
 

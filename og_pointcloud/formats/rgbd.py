@@ -1,18 +1,18 @@
-"""Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, each as its exporter or renderer writes it.
+"""Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, as their exporters or renderers write them.
 
 ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, in the 25k-frame subset,
           ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimeters with intrinsics of its own. A pose
           is all ``-inf`` where tracking was lost. Color and depth share a pose: the extrinsics are the identity.
 7-Scenes  ``frame-000000.color.png``, ``.depth.png``, ``.pose.txt``, in the folder or in ``seq-01/``, ``seq-02/``, ...
-          Depth is 16-bit millimeters. The Kinect was never calibrated: the data set's authors used, and the poses
-          belong to, a depth camera of focal length 585 pixels about the image's middle; color has the wider lens of 525
-          pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, as TSDF-fusion's copies have, where
-          color and depth are registered) replaces both.
+          Depth is 16-bit millimeters. The Kinect was never calibrated: the data set's authors, and so the poses,
+          assume a depth camera with a focal length of 585 pixels, centered in the image; the color camera has the wider
+          lens of 525 pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, in TSDF-fusion's copies,
+          where color and depth are registered) replaces both.
 Replica   as NICE-SLAM renders it: ``results/frame000000.jpg``, ``results/depth000000.png``; line i of ``traj.txt`` is
           the pose of frame i, 16 numbers. ``cam_params.json`` lies in the folder or beside it: ``{"camera": {"w", "h",
-          "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a meter.
+          "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is one meter.
 
-Poses are camera-to-world with OpenCV axes. Pixel centers are counted at whole numbers; the scene has them at +0.5.
+Poses are camera-to-world with OpenCV axes. Pixel centers are at whole numbers; in the scene, at +0.5.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from og_pointcloud.formats.poses import (
 )
 
 DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
-"""Focal lengths of 7-Scenes in pixels of an image of that width."""
+"""Focal lengths of 7-Scenes, in pixels of an image of this width."""
 SEVEN_SCENES_IMAGES = ("frame-*.color.png", "frame-*.color.jpg")
 SEVEN_SCENES_INTRINSICS = "camera-intrinsics.txt"
 REPLICA_PARAMETERS = "cam_params.json"
@@ -50,9 +50,9 @@ REPLICA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 
 def read_rgbd(folder: Path) -> PosedFrames | None:
-    """Poses, cameras and depth files of a data set's folder, frames in order; None where it has no layout of these.
+    """Poses, cameras and depth files of a data set's folder, frames in order; None where it has none of these layouts.
 
-    SceneError names the file that is wrong, and the cure.
+    SceneError names the faulty file and the cure.
     """
     return next((recorded(read(folder)) for holds, read in (*LAYOUTS, *PHONE_LAYOUTS) if holds(folder)), None)
 
@@ -88,7 +88,7 @@ def _scannet(folder: Path) -> Iterator[RecordedFrame]:
     images = numbered_images(folder / "color")
     if not images:
         raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the color frames")
-    # One lens each for all frames; depth images have a size of their own.
+    # One color and one depth lens for all frames; depth images may differ in size.
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETER)
@@ -152,14 +152,14 @@ def _replica(folder: Path) -> Iterator[RecordedFrame]:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
-    # Images and poses go by their place alone: were there fewer poses, it is not known which image lacks its own.
+    # Images and poses are matched by order alone: with fewer poses than images, it is unknown which images lack one.
     if not images or len(images) > len(poses):
         raise SceneError(
             f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "
             "image and a pose for each: copy both from one run"
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
-    lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)  # meters a stored step
+    lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)  # meters per stored step
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
         source = f"{folder / 'traj.txt'}, line {line}"
@@ -184,5 +184,5 @@ LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Iterable[RecordedF
     (_is_replica, _replica),
     (is_kitti360, read_kitti360),
 )
-"""Pairs of a function that says whether a folder has a layout, and one that reads it; the first that fits is taken. A
-layout of your own is a pair more."""
+"""Pairs of functions, one that tests whether a folder has a layout and one that reads it; the first match is used. To
+add a layout, add a pair."""

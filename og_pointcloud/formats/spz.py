@@ -1,13 +1,14 @@
-"""SPZ, Niantic's packed splats: in (versions 2 to 4) and out (version 3).
+"""Read SPZ, Niantic's packed splats (versions 2 to 4), and write it (version 3).
 
-A header, then one column after the other: positions as 24-bit fixed point, opacity, color and log scale in a byte each,
-rotations as three bytes x y z (version 2) or as the smallest three of four parts in 32 bits. Versions 2 and 3 are one
-gzip of all; version 4 packs each column by itself with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's (y
-up, z back), those of a PLY and of the scene are as trained (y down, z forward): y and z change sign, as in converters.
+A header, then the columns: positions as 24-bit fixed point, opacity, color and log scale in one byte per value,
+rotations as three bytes x y z (version 2) or as the smallest three of four components in 32 bits. Versions 2 and 3 are
+a single gzip; version 4 packs each column separately with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's
+(y up, z back), those of a PLY and of the scene are as trained (y down, z forward): y and z change sign, as in other
+converters.
 
-Harmonics above the constant one are neither read, as in PLY files, nor written.
+Harmonics above the constant one are not read, as in PLY files, and not written.
 
-Format: nianticlabs/spz, README, "Internals"; held against SuperSplat's files in the tests.
+Format: nianticlabs/spz, README, "Internals"; tests compare with SuperSplat's files.
 """
 
 from __future__ import annotations
@@ -30,35 +31,35 @@ Bytes = NDArray[np.uint8]
 
 MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
-"""Magic, version, splats, degree of the harmonics, fraction bits, flags, and of version 4 the number of columns."""
+"""Magic, version, splats, degree of the harmonics, fraction bits, flags, and in version 4 the number of columns."""
 HARMONICS = (0, 3, 8, 15, 24)
 """Coefficients per channel above the constant one, by degree."""
 COLOR_SCALE, LOG_SCALE_STEPS, MIN_LOG_SCALE = 0.15, 16.0, -10.0
-"""A byte encodes f_dc as byte / 255 = 0.5 + 0.15 f_dc, and a log scale in steps of 1/16 from -10 on."""
+"""A byte encodes f_dc as byte / 255 = 0.5 + 0.15 f_dc, and a log scale in steps of 1/16 from -10."""
 SIGN_BIT = 1 << 23
 """Of 24-bit integers."""
 MAX_FRACTION_BITS = 23
 MAX_MAGNITUDE = 511
-"""Of a rotation's part, nine bits beside its sign."""
+"""Of a rotation's component: nine bits, without its sign."""
 PART_SHIFTS = np.array([20, 10, 0], np.uint32)
-"""Bits by which the three smaller parts of a rotation, ten bits each, are shifted, in order."""
+"""Bits by which the three smaller components of a rotation, ten bits each, are shifted, in order."""
 AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
-"""Factors of x, y, z, of positions and of quaternions, between the two axis conventions."""
+"""Factors of x, y, z in positions and quaternions, between the two axis conventions."""
 MAX_RATIO, ALWAYS_ALLOWED_BYTES = 20, 1 << 24
-"""A file may unpack to this many times its size, or to this many bytes: quantized noise shrinks to a half."""
+"""A file may unpack to this many times its size, or to this many bytes: quantized noise compresses to half."""
 MAX_STEP_SHARE = 1e-4
 """Largest rounding step of positions, as a share of the cloud's extent."""
 
 
 def looks_like_spz(head: bytes) -> bool:
-    """Whether a file that starts so is an SPZ, or a gzip, which no other format here is."""
+    """Whether a file with these first bytes is an SPZ, or a gzip, which no other format here uses."""
     return head.startswith((MAGIC, GZIP))
 
 
 def read_spz(path: StrPath) -> Points:
     """Gaussians of an SPZ file; world coordinates, the median as origin.
 
-    SceneError, beginning with the path, for a file that is damaged, foreign, or claims more than it holds;
+    SceneError, beginning with the path, for a file that is damaged, of another format, or claims more than it holds;
     MissingExtraError for version 4 without zstandard.
     """
     path = Path(path)
@@ -77,8 +78,8 @@ def read_spz(path: StrPath) -> Points:
 def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
     """Write Gaussians as SPZ version 3, whole or not at all. rgb: (n, 3), instead of the points' own colors.
 
-    Scales leave with steps of 6 % between 4.5e-5 and 379, colors with steps of two of 255; positions as finely as
-    24 bits allow. SceneError where these are no Gaussians, or lie so far from 0 that this is too coarse.
+    Scales are written in steps of 6 % between 4.5e-5 and 379, colors in steps of two of 255; positions as finely as
+    24 bits allow. SceneError where these are not Gaussians, or lie so far from 0 that this is too coarse.
     """
     path = Path(path)
     with naming(path):
@@ -103,7 +104,7 @@ def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
 
 
 def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed: int) -> list[int]:
-    """Bytes of the columns, harmonics last; SceneError where a header cannot be right. packed: bytes of the file."""
+    """Bytes of the columns, harmonics last; SceneError if the header cannot be right. packed: bytes of the file."""
     if data != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MAX_FRACTION_BITS:
         raise SceneError(
             f"its header says {data!r}, version {version}, degree {degree}, {bits} fraction bits; expected 'NGSP', "
@@ -154,7 +155,7 @@ def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
         frame = data[start : start + packed]
         start += packed
         try:
-            # Checked before unpacking: any stated size must be the one that follows from the header.
+            # Checked before unpacking: a stated size must be the one that follows from the header.
             if claimed != size or len(frame) < packed or zstandard.frame_content_size(frame) not in (size, -1):
                 raise SceneError(f"column {number} claims {claimed} bytes in {packed}; expected {size}: copy it again")
             column = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(frame, max_output_size=size)
@@ -174,14 +175,14 @@ def _byte(values: NDArray[np.floating]) -> Bytes:
 
 
 def _fixed_point(parts: Bytes) -> IntArray:
-    """(...) whole numbers with a sign, of three bytes (..., 3) each, the lowest first."""
-    # Flipping the sign bit and taking it off again extends the sign from 24 to 32 bits.
+    """(...) signed integers from three bytes (..., 3) each, lowest first."""
+    # Flipping the sign bit and subtracting it again extends the sign from 24 to 32 bits.
     low, middle, high = np.moveaxis(parts.astype(np.int32), -1, 0)
     return ((low | middle << 8 | high << 16) ^ SIGN_BIT) - SIGN_BIT
 
 
 def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
-    """(n, 9) bytes, and the number of fraction bits: as many as the coordinate farthest from 0 allows."""
+    """(n, 9) bytes, and the number of fraction bits: as many as the largest absolute coordinate allows."""
     farthest = float(np.abs(xyz).max(initial=0.0))
     bits = MAX_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((SIGN_BIT - 1) / farthest)))
     extent = float(np.ptp(xyz, axis=0).max(initial=0.0))
@@ -195,14 +196,14 @@ def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
 
 
 def _three_bytes(rotation: Bytes) -> DoubleArray:
-    """(n, 4) quaternions x y z w of version 2, whose w completes them to length 1."""
+    """(n, 4) quaternions x y z w of version 2, where w follows from length 1."""
     xyz = rotation.reshape(-1, 3) / 127.5 - 1
     return np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1)))])
 
 
 def _smallest_three(words: NDArray[np.uint32]) -> DoubleArray:
-    """(n, 4) quaternions x y z w: two bits name the largest part, which is positive. The others, at most 1/sqrt(2),
-    have nine bits and a sign each; the last one is lowest."""
+    """(n, 4) quaternions x y z w: two bits name the largest component, which is positive. The others, at most
+    1/sqrt(2), have nine bits and a sign each; the last one is in the lowest bits."""
     fields = words[:, None] >> PART_SHIFTS
     size = (fields & MAX_MAGNITUDE) / MAX_MAGNITUDE * np.sqrt(0.5)
     return from_smallest_three(words >> 30, np.where(fields >> 9 & 1, -size, size))
@@ -212,7 +213,7 @@ def _packed_rotation(wxyz: DoubleArray) -> NDArray[np.uint32]:
     """(n,) words that `_smallest_three` reads, of unit quaternions with the scene's axes."""
     xyzw = np.column_stack([wxyz[:, 1:] * AXIS_SIGNS, wxyz[:, 0]])
     largest = np.abs(xyzw).argmax(axis=1)
-    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)  # -q turns as q does
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)  # -q is the same rotation as q
     others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
     size = np.minimum(np.rint(np.abs(others) * np.sqrt(2) * MAX_MAGNITUDE), MAX_MAGNITUDE).astype(np.uint32)
     fields = (size | (others < 0).astype(np.uint32) << 9) << PART_SHIFTS

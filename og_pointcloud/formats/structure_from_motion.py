@@ -2,11 +2,11 @@
 
 COLMAP finds SIFT features, matches pairs and maps incrementally. The choices made here: photographs of one size share a
 lens; every photograph is compared with every other or, if there are more than `MAX_EXHAUSTIVE`, with its neighbors and
-some of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is arbitrary. Seeds
-are fixed.
+a sample of all; the largest model is kept, rotated so that z is up as the cameras were held. Its scale is arbitrary.
+Seeds are fixed.
 
-Structure from motion fails on bare walls, mirrors, or photographs taken from one spot. Then there is an error, and no
-capture of the few photographs that happened to fit.
+Structure from motion fails on bare walls, mirrors, or photographs taken from one spot. This raises an error instead of
+making a capture of the few photographs that happened to fit.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from og_pointcloud.journal import Journal
 
 MODEL_FOLDER = "sparse"
 MIN_SIZE = 3
-"""Photographs of a model."""
+"""Minimum number of photographs in a model."""
 MIN_POSED_SHARE = 0.5
-"""Of the photographs: with fewer poses, a model is a fragment of the scene."""
+"""Share of the photographs: with fewer poses, a model is a fragment of the scene."""
 MAX_EXHAUSTIVE = 120
 """Up to this many photographs all pairs are compared; else only pairs among every k-th, at most this many of them."""
 NEIGHBORS = 10
 """Each photograph is always compared with this many before and after it."""
 PAIRS_PER_CALL = 64
-"""Small, as Ctrl-C and the progress bar wait for the end of a call of COLMAP."""
+"""Small, as Ctrl-C and the progress bar wait for each call of COLMAP to end."""
 SEED = 0
 CURE = (
     "take more photographs from more places, each sharing two thirds with the next, of textured and still things in "
@@ -48,8 +48,8 @@ CURE = (
 @dataclass(frozen=True)
 class PosesFound:
     """capture: its folder. registered, of: numbers of photographs with a pose, and of all. points: number of
-    triangulated ones. error_px: mean error of their reprojection. left_out: names of files without a pose. seconds: of
-    features, matches and mapping, wall clock."""
+    triangulated points. error_px: their mean reprojection error. left_out: names of files without a pose. seconds: of
+    features, matching and mapping, wall clock."""
 
     capture: Path
     registered: int
@@ -68,13 +68,13 @@ def find_poses(
     threads: int = 1,
     progress: bool = False,
 ) -> PosesFound:
-    """Make a capture folder of photographs: ``sparse/0``, as COLMAP writes it.
+    """Make a capture folder from photographs: ``sparse/0``, as COLMAP writes it.
 
     photographs: the folder with them, or one whose ``images/`` has them. capture: the folder to make, with a link to
         the photographs; None: beside them.
-    longest_side: features are found in images shrunk to this, pixels. threads: of all steps; one makes the same model
-        again, more of them may not.
-    SceneError where there are too few photographs, a model is there already, or fewer than half find their place.
+    longest_side: features are found in images shrunk to this, pixels. threads: for all steps; one thread is
+        deterministic, several may not be.
+    SceneError where there are too few photographs, a model exists already, or fewer than half get a pose.
     MissingExtraError without pycolmap.
     """
     source = Path(photographs)
@@ -85,7 +85,7 @@ def find_poses(
         _require_enough(model, files)
         placed = _put_back_names(model, files)
         _turn_upright(model)
-        # Nothing is in the capture before all is done.
+        # Nothing is put into the capture before everything is done.
         with replacing_folder(target / MODEL_FOLDER) as folder:
             (folder / "0").mkdir(parents=True)
             model.write_binary(str(folder / "0"))
@@ -114,12 +114,12 @@ def _photographs(source: Path, target: Path) -> list[Path]:
 def _pycolmap() -> Any:
     with naming_extra("pycolmap", "poses"):
         import pycolmap  # pyright: ignore[reportMissingImports]
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # failures are reported here
     return pycolmap
 
 
 class _Run:
-    """The three steps on one database. Photographs go by their numbers: COLMAP's list of pairs takes no spaces."""
+    """The three steps on one database. Photographs are named by number: COLMAP's list of pairs allows no spaces."""
 
     def __init__(self, files: Sequence[Path], work: Path, longest_side: int, threads: int, journal: Journal) -> None:
         self._colmap, self._journal, self._threads = _pycolmap(), journal, threads
@@ -132,7 +132,7 @@ class _Run:
             (self._folder / name).symlink_to(file.resolve())
 
     def model(self) -> Any:
-        """The largest model, None where there is none."""
+        """The largest model, or None."""
         with self._journal.stage("features"):
             self._find_features()
         with self._journal.stage("matches"):
@@ -149,7 +149,7 @@ class _Run:
         for number in self._journal.steps(range(len(self._names)), "features"):
             reader, size = colmap.ImageReaderOptions(), self._sizes[number]
             reader.existing_camera_id = camera_of_size.get(size, -1)
-            camera_of_size.setdefault(size, len(camera_of_size) + 1)  # as COLMAP counts them
+            camera_of_size.setdefault(size, len(camera_of_size) + 1)  # COLMAP's numbers
             colmap.extract_features(
                 self._database, self._folder, [self._names[number]], colmap.CameraMode.SINGLE, reader, options,
                 colmap.Device.cpu,
@@ -200,7 +200,7 @@ def _require_enough(model: Any, files: Sequence[Path]) -> None:
 
 
 def _put_back_names(model: Any, files: Sequence[Path]) -> set[str]:
-    """Call the model's images as their files; the names of those with a pose."""
+    """Rename the model's images to their file names; returns the names of those with a pose."""
     placed = set()
     for number in model.reg_image_ids():
         image = model.images[number]
@@ -210,7 +210,7 @@ def _put_back_names(model: Any, files: Sequence[Path]) -> set[str]:
 
 
 def _turn_upright(model: Any) -> None:
-    """Turn the world so that z is where the photographs' upper borders point to, on average."""
+    """Rotate the world so that z is the mean upward direction of the photographs."""
     # The second row of a rotation, world to camera, is the camera's y axis (down) in the world.
     poses = [model.images[number].cam_from_world().matrix() for number in model.reg_image_ids()]
     up = -np.mean([pose[1, :3] for pose in poses], axis=0)

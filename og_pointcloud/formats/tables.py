@@ -19,13 +19,13 @@ from og_pointcloud.errors import SceneError
 
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 LABEL_FINITE = "save as .ply or .npz, which can hold them, or label points[np.isfinite(points).all(axis=1)] alone"
-"""The cure where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
+"""The cure if a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 
 
 def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Rows as CSV with the union of their names as columns; text that a spreadsheet would take for a formula gets a
-    quote mark before it."""
+    """Rows as CSV with the union of their names as columns; text that a spreadsheet would take for a formula is
+    prefixed with a quote mark."""
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
     writer.writeheader()
@@ -39,7 +39,7 @@ def _as_cell(value: object) -> object:
 
 @contextmanager
 def naming(place: str | Path) -> Iterator[None]:
-    """Put a file's path, or a place in it, before errors raised inside, once; errors of the disk become SceneError."""
+    """Prefix errors raised inside with a file's path, or a place in it, once; disk errors become SceneError."""
     try:
         yield
     except SceneError as error:
@@ -52,15 +52,15 @@ def naming(place: str | Path) -> Iterator[None]:
 
 
 def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: str) -> NDArray[np.void]:
-    """The next ``count`` rows of an ascii file, one a line, blank lines skipped, as (count,) records of ``dtype``.
+    """The next ``count`` rows of an ascii file, one per line, blank lines skipped, as (count,) records of ``dtype``.
 
-    Takes no line beyond its last row. SceneError where a value does not fit its type, or rows are missing.
+    Reads no line beyond the last row. SceneError where a value does not fit its type, or rows are missing.
     """
     rows_text = islice((line for line in lines if not line.isspace()), count)
-    rows, first = np.empty(0, dtype), next(rows_text, None)  # numpy warns of input without a line
+    rows, first = np.empty(0, dtype), next(rows_text, None)  # numpy warns of empty input
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 would store 300 as a byte, as 44
+            warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 would store 300 in a byte as 44
             if first is not None:
                 rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
     except DeprecationWarning as error:
@@ -77,7 +77,7 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
 
 
 def read_binary_rows(file: BinaryIO, dtype: np.dtype, count: int, what: str) -> NDArray:
-    """The next ``count`` values of ``dtype`` of a binary file; SceneError, before room is made, where it has fewer."""
+    """The next ``count`` values of ``dtype`` of a binary file; SceneError, before allocation, if it has fewer."""
     left = os.fstat(file.fileno()).st_size - file.tell()
     if count * dtype.itemsize > left:
         raise SceneError(
@@ -88,7 +88,7 @@ def read_binary_rows(file: BinaryIO, dtype: np.dtype, count: int, what: str) -> 
 
 
 def stack_columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
-    """Columns side by side: (n, len(names)) float64. SceneError names the columns that are not there."""
+    """Columns side by side: (n, len(names)) float64. SceneError names the missing columns."""
     scalar = [name for name in rows.dtype.names or () if rows.dtype[name].shape == ()]
     missing = [name for name in names if name not in scalar]
     if missing:
@@ -96,7 +96,7 @@ def stack_columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.fl
             f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar):.60}"
         )
     stacked = np.empty((len(rows), len(names)))
-    with np.errstate(invalid="ignore"):  # widening a signalling NaN warns; NaN is for the caller to judge
+    with np.errstate(invalid="ignore"):  # widening a signalling NaN warns; NaN is left to the caller
         for column, name in enumerate(names):
             stacked[:, column] = rows[name]
     return stacked
@@ -111,11 +111,11 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     """(n, 3) uint8 RGB, or None without color columns.
 
     Takes uint8; uint16 (full range); other numbers in 0..1 or 0..255, told apart by their maximum; and PCL's packed
-    ``rgb``/``rgba``, 0xAARRGGBB in four bytes, also where the file calls these bytes a float.
+    ``rgb``/``rgba``, 0xAARRGGBB in four bytes, also if the file declares these bytes a float.
     """
     packed = _first_present(rows, tuple((name,) for name in PACKED_COLOR_COLUMNS))
     if packed and rows.dtype[packed[0]].itemsize == 4:
-        # The bytes as they are: taken as numbers, float colors would be tiny or NaN.
+        # Reinterpret the bytes: as numbers, float colors would be tiny or NaN.
         bits = rows[packed[0]].view(np.uint32)
         return np.stack([(bits >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
     names = _first_present(rows, COLOR_COLUMNS)
@@ -151,6 +151,6 @@ def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:
 
 
 def _first_present(rows: NDArray[np.void], choices: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
-    """The first of ``choices`` whose columns are all there, else ()."""
+    """The first of ``choices`` whose columns are all present, else ()."""
     present = set(rows.dtype.names or ())
     return next((names for names in choices if present.issuperset(names)), ())

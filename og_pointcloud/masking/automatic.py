@@ -1,8 +1,8 @@
 """Masks of everything in an image, by a model that takes point prompts: it is prompted on a grid, and the good
 masks are kept, without duplicates.
 
-As in segment-anything's automatic generator, masks with a low predicted IoU or an unstable border are dropped, the best
-of masks with nearly the same box stays, small holes are filled and small islands removed.
+As in segment-anything's automatic generator, masks with a low predicted IoU or an unstable border are dropped, only
+the best of masks with nearly the same box is kept, small holes are filled and small islands removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PointPredictor(Protocol):
         ...
 
     def at_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """points (k, 2) -> logits (k, m, h, w) of m candidate masks each, at the model's own size without padding, so
+        """points (k, 2) -> logits (k, m, h, w) of m candidate masks each, at the model's resolution without padding, so
         that they cover the image; and predicted IoU (k, m)."""
         ...
 
@@ -60,7 +60,7 @@ class AutomaticMasks:
         batches = (points[first : first + self.batch] for first in range(0, len(points), self.batch))
         kept = [self._accepted(*self.predictor.at_points(batch)) for batch in batches]
         logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
-        # Duplicates are removed while masks are small: most prompts find a thing that others found too.
+        # Duplicates are removed at low resolution: most prompts find a thing that others found too.
         best = suppress_duplicates(logits > 0, scores, self.same_box)
         masks = np.zeros((len(best), height, width), np.bool_)
         for mask, chosen in zip(masks, best, strict=True):
@@ -108,7 +108,7 @@ def _specks(mask: Masks, smallest_px: int, spare_largest: bool) -> Masks:
     _, labels, stats, _ = require_cv2().connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     area = stats[:, require_cv2().CC_STAT_AREA]
     small = area < smallest_px
-    small[0] = False  # label 0 is what is outside of the mask
+    small[0] = False  # label 0 is outside the mask
     if spare_largest and len(area) > 1:
         small[1 + int(np.argmax(area[1:]))] = False
     return small[labels]

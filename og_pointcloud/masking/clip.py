@@ -31,9 +31,8 @@ class ImageTower(torch.nn.Module):
     """Pixels (B, 3, h * patch, w * patch) float32 -> unit vectors of images (B, D) and of their patches (B, h, w, D).
 
     A model pools an image into one vector in its last attention: CLIP in its last layer, by the class token; SigLIP in
-    its head, by a probe. For the vectors of patches, each patch there attends to itself alone, which yields its own
-    value, in the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai,
-    ECCV 2022), section 3.2.
+    its head, by a probe. For patch vectors, each patch attends to itself alone in that layer, which yields its own
+    value, in the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai, ECCV 2022), section 3.2.
     """
 
     def __init__(self, model: Any) -> None:
@@ -47,8 +46,8 @@ class ImageTower(torch.nn.Module):
         seen = vision(pixel_values=pixels, interpolate_pos_encoding=True, output_hidden_states=True)
         if self.model.config.model_type == "clip":
             image = self.model.visual_projection(seen.pooler_output)
-            # The last layer once more, on what goes into it, without the class token: a softmax over one token is 1, so
-            # that attention is the token's own value.
+            # Run the last layer again on its input, without the class token: a softmax over one token is 1, so that
+            # attention returns the token's own value.
             last, tokens = vision.encoder.layers[-1], seen.hidden_states[-2][:, 1:]
             attention = last.self_attn
             tokens = tokens + attention.out_proj(attention.v_proj(last.layer_norm1(tokens)))
@@ -76,7 +75,7 @@ class TransformersModel:
         crops: tuple[Crop, ...] = WITH_CONTEXT,
         attention: Attention = "sdpa",
     ) -> None:
-        """feature_space: None: as the folder's configuration states it. Errors: as ``load_model``."""
+        """feature_space: None: from the folder's configuration. Errors: as ``load_model``."""
         self.feature_space = feature_space or published_name(folder)
         model = load_model(folder, attention)
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
@@ -99,7 +98,7 @@ class TransformersModel:
 
 
 def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
-    """As preprocessor_config.json states it, else as the family's published models have it. config: the model's."""
+    """From preprocessor_config.json, else that of the family's published models. config: the model's."""
     stated = read_config(Path(folder), "preprocessor_config.json")
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:

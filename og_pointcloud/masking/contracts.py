@@ -1,4 +1,4 @@
-"""What proposers, encoders and the code that runs them agree on: protocols, and the settings."""
+"""The interface of proposers, encoders and the code that runs them: protocols and settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Proposals:
     """Masks of one image; they may overlap, and contain one another.
 
     masks: (M, H, W) bool. scores: (M,) float32 in [0, 1], the proposer's confidence, 1 where no model scored them.
-    tracks: (M,) int64, from a tracker: one number in all images for what it takes for one thing, -1 unknown.
+    tracks: (M,) int64, from a tracker: one number per thing, the same in all images, -1 unknown.
     """
 
     masks: NDArray[np.bool_]
@@ -49,7 +49,7 @@ class MaskProposer(Protocol):
     """Where things are in an image."""
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
-        """image: (H, W, 3) uint8 RGB. Returns Proposals of length 0, not an error, where it finds nothing."""
+        """image: (H, W, 3) uint8 RGB. Returns Proposals of length 0 if it finds nothing."""
         ...
 
 
@@ -70,8 +70,8 @@ class MaskEncoder(Protocol):
 class ImageModel(Protocol):
     """Squares of pixels -> vectors.
 
-    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
-    patches that it can also encode, pixels; None where it cannot.
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side in
+    pixels of the patches that it can also encode; None if it cannot.
     """
 
     feature_space: str
@@ -97,7 +97,7 @@ class MaskSettings:
     level: small, medium or large (`levels.PARTS_WEIGHT`).
     features: crops, a few encoder runs per mask; or dense, one per image, coarser (`masking/dense.py`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
-    every: every n-th image is used.
+    every: use every n-th image.
     words: what to look for, with a proposer that takes words (`sam3`).
     tracks: things are followed from image to image, in the order of the pose file. With a folder of id PNGs: an id
         means the same thing in all images, as video trackers write them.
@@ -119,7 +119,7 @@ class MaskSettings:
             raise OgPointcloudError(f"features are '{self.features}' without an encoder; expected one, or crops")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
-        if isinstance(self.words, str):  # would be read as a word per letter
+        if isinstance(self.words, str):  # would become one word per letter
             raise OgPointcloudError(f"words are {self.words!r:.60}; expected a tuple of them, as ({self.words!r:.60},)")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
@@ -130,7 +130,7 @@ class MaskSettings:
     def folder(self) -> Path | None:
         """The folder of masks, where one is given instead of a proposer's name; else None."""
         folder = Path(self.proposer)
-        # A folder called opencv, such as a clone, is not meant.
+        # "opencv" never means a folder of that name, such as a clone.
         return folder if self.proposer != "opencv" and folder.is_dir() else None
 
     @property

@@ -2,7 +2,8 @@
 
 LangSplat's cut-out is the mask's tight box with black outside the mask, padded to a square. Better ones show the
 thing's surroundings: a larger window, and outside the mask a blend of the image with a uniform color, so that the
-encoder sees the chairs around a table, and still which thing is meant. Several are weighted into one vector.
+encoder sees the chairs around a table but also which thing is meant. The vectors of several crops are averaged by
+weight.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ MAX_SIZE = 4096
 class Crop:
     """One way to cut a mask out.
 
-    scale: side of the window as a multiple of the longer side of the mask's box. outside: how much the image shows
-    outside the mask, from 0, not at all, to 1, fully. weight: of this crop's vector in the mask's.
+    scale: side of the window as a multiple of the longer side of the mask's box. outside: how much of the image shows
+    outside the mask, from 0, nothing, to 1, all. weight: of this crop's vector in the mask's.
     """
 
     scale: float = 1.0
@@ -69,12 +70,12 @@ class Preprocessing:
     @classmethod
     def from_manifest(cls, entry: Mapping[str, Any]) -> Preprocessing:
         """From a JSON object's fields; TypeError for unknown ones."""
-        known = {name: value for name, value in entry.items() if name != "keeps_shape"}  # of earlier exports, unused
+        known = {name: value for name, value in entry.items() if name != "keeps_shape"}  # from earlier exports, unused
         return cls(**{**known, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
 
     @property
     def fill(self) -> tuple[int, int, int]:
-        """The color that becomes zero, or nearly, and so carries no information."""
+        """The color that is normalized to about zero, and so carries no information."""
         red, green, blue = (round(255 * value) for value in self.mean)
         return red, green, blue
 
@@ -101,7 +102,7 @@ def mask_crops(
     """
     require_masks(image, masks)
     pillow = require_pillow()
-    # The whole image as it looks outside masks: made once, not for every mask.
+    # The whole image as it looks outside masks, computed once for all masks.
     faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(np.uint8)
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):

@@ -1,7 +1,7 @@
 """A mask's vector from one run of the encoder on the whole image: the mean of its patches. Faster than crops, coarser.
 
-Crops show the encoder each mask by itself, in several runs a mask. Here it sees the image once, and a mask's vector is
-the mean of its patches' vectors, each weighted by how much of the patch the mask covers. Patch vectors that describe
+Crops show the encoder each mask by itself, in several runs per mask. Here it sees the image once, and a mask's vector
+is the mean of its patches' vectors, each weighted by how much of the patch the mask covers. Patch vectors that describe
 the patch rather than the whole image are made as in MaskCLIP (Zhou, Loy and Dai, ECCV 2022): see `clip.ImageTower`.
 """
 
@@ -43,10 +43,10 @@ class DenseEncoder(MaskEncoder):
         return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def _pixels(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(1, 3, h, w) float32, a whole number of patches along each side; the image's shape but for rounding."""
+        """(1, 3, h, w) float32, whole patches along each side; the image's aspect ratio up to rounding."""
         before, pillow = self.model.preprocessing, require_pillow()
-        # Both sides by one scale, then each to its nearest whole patch: models were trained on squares, but a squeezed
-        # image would show squeezed things.
+        # Both sides by one scale, then each rounded to whole patches: models were trained on squares, but squeezing an
+        # image would squeeze the things in it.
         scale = SHORTER_SIDE_SCALE * before.size / min(image.shape[:2])
         height, width = (max(1, round(side * scale / self.patch)) * self.patch for side in image.shape[:2])
         resized = pillow.fromarray(image).resize((width, height), pillow.Resampling[before.resample.upper()])

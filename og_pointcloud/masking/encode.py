@@ -6,12 +6,11 @@
 - folders that ``og-pointcloud export image`` wrote, run by onnxruntime:
     manifest.json       format, schema_version, feature_space, width, preprocessing, crops, bytes and checksums of the
                         graph, parity figures against torch
-    image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows; where the manifest has a patch,
-                        pixels (B, 3, h * patch, w * patch), and -> patches (B, h, w, D) float32, unit vectors, too
-- "demo", such a folder that comes with the library; it knows only the things of the procedural room.
+    image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows; if the manifest has a patch,
+                        pixels (B, 3, h * patch, w * patch), and also -> patches (B, h, w, D) float32, unit vectors
+- "demo", such a folder shipped with the library; it knows only the things of the procedural room.
 
-A folder may come from a stranger, so it is checked before its graph is run: nothing is unpickled, and none of its code
-runs.
+A folder may be untrusted, so it is checked before its graph is run: nothing is unpickled, and none of its code runs.
 """
 
 from __future__ import annotations
@@ -49,15 +48,15 @@ OPERATORS = frozenset({
 """The operators that an encoder's graph may have: arithmetic, without loops, random numbers or graphs inside nodes."""
 ENCODER = EncoderFormat("og-image-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
-"""Bounds memory: a large model takes some 100 MB per crop."""
+"""Bounds memory: a large model takes about 100 MB per crop."""
 
 
 def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
     """Open an encoder; nothing is downloaded.
 
     name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
-        needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
-        what Hugging Face's own tools have fetched.
+        needs torch; or OWNER/MODEL, searched for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
+        the downloads of Hugging Face's own tools.
     features: "crops", a few model runs per mask (`CropEncoder`), or "dense", one per image (`dense.DenseEncoder`).
     Raises OgPointcloudError where there is no such encoder, and where a model has no patches, which "dense" needs.
     """
@@ -75,7 +74,7 @@ def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
 def _open_model(name: StrPath) -> ImageModel:
     if name == "demo":
         return OnnxModel(DEMO_FOLDER / "image")
-    # A folder by its path, then by its stated feature space, then what other tools have fetched.
+    # A folder by its path, then by its stated feature space, then downloads of other tools.
     path = Path(name).expanduser()
     if path.exists():
         return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path)
@@ -121,7 +120,7 @@ class CropEncoder(MaskEncoder):
 
     def _vectors(self, image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDArray[np.float32]:
         before = self.model.preprocessing
-        # LangSplat's crops are black outside, which is a color to the model. A blend should fade to no information.
+        # LangSplat's crops are black outside, which the model sees as a color. A blend should fade to no information.
         fill = before.fill if crop.outside else (0, 0, 0)
         return self.model(before.pixels(mask_crops(image, masks, crop, before.size, fill, before.resample)))
 
@@ -130,7 +129,7 @@ class OnnxModel:
     """An exported image encoder (an `ImageModel`), run by onnxruntime."""
 
     def __init__(self, folder: StrPath) -> None:
-        """folder: what ``og-pointcloud export image`` wrote; OgPointcloudError where it is damaged or another's."""
+        """folder: written by ``og-pointcloud export image``; OgPointcloudError if it is damaged or something else."""
         self.where = str(folder)
         files = ENCODER.read(Path(folder))
         self.manifest = ENCODER.checked(files, self.where, self._take)

@@ -1,4 +1,4 @@
-"""Masks that exist already: id images, COCO annotations, and what a user's function returns."""
+"""Existing masks: id images, COCO annotations, and results of a user's function."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
 MAX_MASKS_PX = 1 << 33
-"""Pixels of all masks of one image together: more are refused before allocation."""
+"""Total pixels of all masks of one image: more are refused before allocation."""
 
 
 def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> Proposals:
@@ -35,10 +35,10 @@ def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> P
 
 
 def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
-    """What a user's function returned, as proposals for an image of ``shape`` (H, W).
+    """The result of a user's function as proposals for an image of ``shape`` (H, W).
 
     It may return Proposals; bool (M, H, W), which get the score 1; or an integer id map (H, W), negative outside every
-    mask, or 0 if nothing is negative.
+    mask, or 0 there if no id is negative.
     """
     masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
     if masks.shape[-2:] != shape:
@@ -57,8 +57,8 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
 
 @dataclass(frozen=True)
 class CallableProposer:
-    """A user's function, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer. name: the function's,
-    for errors."""
+    """A user's function, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer. name: of the
+    function, for errors."""
 
     function: Callable[[NDArray[np.uint8]], Any]
     name: str
@@ -87,9 +87,9 @@ def user_proposer(place: str) -> MaskProposer:
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
         file = user_file(place)
-        # A file is run by its path, not imported: one called numpy.py does not take numpy's place.
+        # A file is run by its path, not imported: one called numpy.py does not shadow numpy.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever running the module may raise
+    except Exception as error:  # the module may raise anything
         raise SceneError(
             f"no proposer 'python:{place}' ({_user_error(error)}); expected a name in {module}.py here, or in an "
             "installed module"
@@ -101,7 +101,7 @@ def user_proposer(place: str) -> MaskProposer:
 
 
 def user_file(place: str) -> Path:
-    """Where the file of ``MODULE:NAME`` would be."""
+    """The path that the file of ``MODULE:NAME`` would have."""
     return Path(f"{place.partition(':')[0].replace('.', '/')}.py")
 
 
@@ -172,7 +172,7 @@ class ExistingMasks:
 def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
     """COCO's run-length code -> (H, W) bool. rle: {"size": [H, W], "counts": list of runs, or COCO's compressed text}.
 
-    Runs alternate, background first, down the columns. SceneError where sizes are absurd, or runs do not add up.
+    Runs alternate, background first, down the columns. SceneError where sizes are absurd, or runs do not fill them.
     """
     if not isinstance(rle, dict):
         raise SceneError(f"{source} is {type(rle).__name__}; expected a record with size and counts")
@@ -192,7 +192,7 @@ def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
 
 
 def _size(size: Any, source: str) -> tuple[int, int]:
-    """[height, width] of a mask, checked before anything of that size is made."""
+    """[height, width] of a mask, checked before anything of that size is allocated."""
     if not (isinstance(size, list) and len(size) == 2 and all(type(length) is int and length > 0 for length in size)):
         raise SceneError(f"{source}: size is {size!r:.60}; expected [height, width] in pixels")
     if size[0] * size[1] > MAX_PIXELS:
@@ -201,9 +201,9 @@ def _size(size: Any, source: str) -> tuple[int, int]:
 
 
 def _decompressed(text: str | bytes, source: str) -> list[int]:
-    """Run lengths from COCO's text (cocoapi, maskApi.c, rleToString). A character, less 48, has six bits: five of the
-    number, lowest first, and a sixth set if more follow; the fifth bit of the last one is the sign. From the fourth run
-    on, numbers are differences to the run two before."""
+    """Run lengths from COCO's text (cocoapi, maskApi.c, rleToString). Each character, less 48, has six bits: five of
+    the number, lowest first, and a sixth that is set if more follow; the fifth bit of the last character is the sign.
+    From the fourth run on, numbers are differences from the run two before."""
     data = text.encode("latin-1", "replace") if isinstance(text, str) else text
     runs: list[int] = []
     value = shift = 0
@@ -214,7 +214,7 @@ def _decompressed(text: str | bytes, source: str) -> list[int]:
         value |= (bits & 31) << shift
         shift += 5
         if not bits & 32:
-            if bits & 16:  # two's complement of so many bits
+            if bits & 16:  # two's complement of the bits read so far
                 value -= 1 << shift
             runs.append(value + runs[-2] if len(runs) > 2 else value)
             value = shift = 0

@@ -1,10 +1,10 @@
 """Overlapping proposals -> one id map at a level: small, medium or large.
 
-Of proposals that nearly coincide, the best scored stays. A mask that lies inside another is its child, so masks form a
-forest. A level is a cut through the forest: a mask is used instead of its parts if its value, area times score, is at
-least the best total value of its parts, times the level's `PARTS_WEIGHT`. A smaller weight cuts higher or equally high
-everywhere, so a small mask lies in a medium one and that in a large one. Where masks of one level still overlap, the
-better scored one takes the pixels.
+Of proposals that nearly coincide, the one with the best score is kept. A mask that lies inside another is its child, so
+masks form a forest. A level is a cut through the forest: a mask is used instead of its parts if its value, area times
+score, is at least the best total value of its parts, times the level's `PARTS_WEIGHT`. A smaller weight cuts higher or
+equally high everywhere, so a small mask lies in a medium one, which lies in a large one. Where masks of one level still
+overlap, the one with the better score takes the pixels.
 
 Everything is computed on atoms, the sets of pixels covered by the same masks: exact, and independent of the image's
 size after one pass.
@@ -19,27 +19,27 @@ from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.scene import DoubleArray, IntArray
 
 PARTS_WEIGHT = {"small": 1.6, "medium": 1.0, "large": 0.6}
-"""Level -> weight of the value of a mask's parts against its own: more prefers parts, less prefers wholes."""
+"""Level -> weight of the value of a mask's parts against its own: a higher weight favors parts, a lower wholes."""
 SAME_IOU = 0.8
-"""Two masks with a larger IoU are one."""
+"""Two masks with a larger IoU are the same mask."""
 INSIDE_SHARE = 0.9
 """A mask with more than this share of its area in a larger one is its child."""
 VISIBLE_SHARE = 0.3
-"""A mask of which better ones leave less than this share visible is dropped."""
+"""A mask is dropped if better ones leave less than this share of it visible."""
 
 
 def masks_of_level(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[np.intp]]:
-    """(H, W) int32: -1 outside every mask of this level of `PARTS_WEIGHT`, else 0..K-1, the best scored mask first; and
-    (K,) the proposal of each id."""
+    """(H, W) int32: -1 outside every mask of this level of `PARTS_WEIGHT`, else 0..K-1 by descending score; and (K,)
+    the proposal of each id."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # better first, then smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
-    # (M, M) pixels that each pair of masks shares; on the diagonal the area of each.
+    # (M, M) pixels shared by each pair of masks; on the diagonal, areas.
     shared_px = (member * area_px) @ member.T.astype(np.float64)
     kept = _distinct(shared_px)
     member, scores, shared_px = member[kept], scores[kept], shared_px[np.ix_(kept, kept)]
     used = _cut(np.diag(shared_px), scores, _parents(shared_px), PARTS_WEIGHT[level])
-    # Ids 0..K-1 of the masks that own an atom, best first, as masks are ordered.
+    # Ids 0..K-1 of the masks that own an atom, best first, in the order of the masks.
     shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
     ids = ids - (shown[:1] < 0).sum()  # -1, if present, is the first owner
     return ids.astype(np.int32)[atom_of_pixel], order[kept][shown[shown >= 0]]
@@ -47,7 +47,7 @@ def masks_of_level(proposals: Proposals, level: str) -> tuple[IntArray, NDArray[
 
 def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], DoubleArray]:
     """(H, W) the atom of each pixel; (M, atoms) which masks cover each atom; (atoms,) its area in pixels."""
-    # Each mask is a random number, a set of masks their sum: two sets collide once in 2^63 draws or so.
+    # Each mask gets a random number, a set of masks their sum: two sets collide about once in 2^63 draws.
     rng = np.random.default_rng(0)
     signature = np.zeros(masks.shape[1:], np.uint64)
     for mask in masks:
@@ -69,7 +69,7 @@ def _distinct(shared_px: DoubleArray) -> NDArray[np.intp]:
 
 
 def _parents(shared_px: DoubleArray) -> NDArray[np.intp]:
-    """(M,) the smallest larger mask that each lies in, -1 for none."""
+    """(M,) the smallest larger mask that contains each, -1 for none."""
     area_px = np.diag(shared_px)
     parent = np.full(len(area_px), -1)
     for mask, area in enumerate(area_px):

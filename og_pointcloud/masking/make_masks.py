@@ -2,7 +2,7 @@
 
 The masks of each image are first a separate file in ``masks.work/``, written whole or not at all. Once complete, they
 become ``masks/`` with ``mask_features.npz``, and ``masks.work/`` is removed. After a kill at any moment, the same
-command resumes after the last finished image; where everything is made already it does nothing. ``made.json`` beside
+command resumes after the last finished image; if everything is finished, it does nothing. ``made.json`` beside
 the masks records that they were made here, and how.
 """
 
@@ -35,7 +35,7 @@ from og_pointcloud.masking.photographs import Photograph, read_photographs, writ
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
 VERSION = 3
-"""Of the contents of an image's work file; files of another version are made again."""
+"""Version of the contents of an image's work file; files of other versions are made again."""
 WORK_FOLDER = "masks.work"
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 4
@@ -43,8 +43,8 @@ PREVIEW_IMAGES = 4
 
 @dataclass(frozen=True)
 class MasksMade:
-    """images: how many were used; done_before: how many of these an interrupted run had done. masks: how many there are
-    in all images. left_out: names of images that were not used. seconds: wall clock."""
+    """images: number used; done_before: number of these that an interrupted run had done. masks: total number.
+    left_out: names of images that were not used. seconds: wall clock."""
 
     output: Path
     images: int
@@ -65,12 +65,12 @@ def make_masks(
 ) -> MasksMade:
     """Make the masks of a capture folder, readable by `read_capture`.
 
-    output: where they go; None: into the capture. Another folder becomes a capture of its own: poses of the images that
-    are used, and links to everything else. It is needed where images are left out.
+    output: where they go; None: into the capture. Another folder becomes a separate capture: poses of the images that
+    are used, and links to everything else. It is required where images are left out.
     overwrite: replace masks that were not made here, and make complete ones again. progress: show a bar with the
     remaining time where stderr is a terminal; masks_preview.png shows the first images as soon as they are done.
-    Warns of each image that is broken, and raises SceneError once the others are done and kept; OgPointcloudError where
-    masks that were not made here would be overwritten.
+    Warns of each image that is broken, and raises SceneError once the others are finished and saved; OgPointcloudError
+    where masks that were not made here would be overwritten.
     """
     settings, start = settings or MaskSettings(), time.perf_counter()
     capture = Path(capture)
@@ -82,7 +82,7 @@ def make_masks(
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate)
     _refuse_foreign(target, overwrite)
-    # Names of work files encode all that determines their contents, so that existing ones can be reused.
+    # Names of work files encode everything that determines their contents, so that existing ones can be reused.
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(each, work / f"{_digest([each.name, *_state(each.file)])}.npz") for each in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
@@ -102,12 +102,12 @@ def make_masks(
     return MasksMade(target, len(tasks), done_before, made["masks"], left_out, space, time.perf_counter() - start)
 
 
-# Which images, and what of them is done -----------------------------------------------------------------------------
+# Which images, and which are finished -------------------------------------------------------------------------------
 
 
 def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], separate: bool) -> tuple[str, ...]:
-    """Names of the images that are not used; OgPointcloudError if there are some and the output is no folder of its
-    own."""
+    """Names of the images that are not used; OgPointcloudError if there are any and the output is not a separate
+    folder."""
     used = {photograph.name for photograph in chosen}
     names = tuple(photograph.name for photograph in photographs if photograph.name not in used)
     if names and not separate:
@@ -119,8 +119,8 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """A name for settings, and for the user's masks or code that they refer to: work files of others are not reused."""
-    of_image = replace(settings, every=1)  # which images are used does not change the masks of one
+    """A name for settings and the user's masks or code that they refer to: other work files are not reused."""
+    of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
     given = sorted(settings.folder.rglob("*")) if settings.folder else [user_file(place)] if kind == "python" else []
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
@@ -147,7 +147,7 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
         if wrong:
             broken.append(wrong)
             warnings.warn(wrong, stacklevel=4)
-        # So wrong masks are noticed after the first images, not after a night.
+        # So that wrong masks are noticed after the first images, not after a night.
         done = [] if previewed else [task for task in tasks if task.work_file.exists()]
         if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
             shown = [(task.photograph.read(settings.longest_side), task.work_file) for task in done[:PREVIEW_IMAGES]]
@@ -160,14 +160,14 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
         )
 
 
-# The files that masks end in, and the record by which the next run knows them -------------------------------------
+# The final files, and the record by which the next run recognizes them --------------------------------------------
 
 
 def _refuse_foreign(target: Path, overwrite: bool) -> None:
     """OgPointcloudError where masks or features that were not made here would be replaced, or folders are links."""
     folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
     for link in (folder, target / WORK_FOLDER):
-        if link.is_symlink():  # a stranger's capture could redirect masks anywhere by it
+        if link.is_symlink():  # an untrusted capture could redirect masks anywhere
             raise OgPointcloudError(
                 f"{link} is a link to '{link.readlink()}'; expected a folder of the capture's own, as nothing is "
                 "written through links: remove it, or give another folder (-o DIR)"
@@ -195,10 +195,10 @@ def _made_before(target: Path, tasks: Sequence[ImageTask], key: str) -> dict[str
 
 
 def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> tuple[int, str]:
-    """Write the capture's files from the work files. Number of masks, and the feature space."""
+    """Write the capture's files from the work files; returns the number of masks and the feature space."""
     folder = target / MASKS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    # First, and without a key: after a kill in here the next run recognizes the folder as ours, but incomplete.
+    # First, and without a key: after a kill from here on, the next run recognizes the folder as ours but incomplete.
     _write_made(target, settings, tasks)
     features: dict[str, Any] = {}
     space, masks = UNKNOWN_SPACE, 0
@@ -208,7 +208,7 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
         features[name], masks = work["features"], masks + len(work["features"])
         if "tracks" in work:
             features[name + TRACKS] = work["tracks"]
-        # 16 bit: 0 outside every mask, else the row of the features + 1
+        # 16 bit: 0 outside every mask, else the feature row + 1
         write_png(folder / f"{name}.png", (work["ids"] + 1).astype(np.uint16))
     with replacing(target / FEATURES_NAME) as file:
         np.savez(file, feature_space=np.array(space), **features)
@@ -223,17 +223,17 @@ def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]
 
 
 def _last_part(value: Any) -> Any:
-    """A path reduced to its last part: captures are passed on, and where models lie on this machine is private."""
+    """A path reduced to its last part: captures are shared, and paths of models on this machine are private."""
     kind, colon, name = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     return f"{kind}{colon}{Path(name).name}" if Path(name).is_absolute() else value
 
 
 def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) -> None:
-    """Poses of the chosen images, and links to all else that the capture has and the target lacks."""
+    """Write poses of the chosen images, and links to everything else that the capture has and the target lacks."""
     kept = {photograph.path for photograph in chosen}
     others = {MASKS_FOLDER, FEATURES_NAME, LANGUAGE_FEATURES_FOLDER, WORK_FOLDER}
     for source in sorted(capture.resolve().iterdir()):
-        if source.name in others or source == target.resolve():  # which may lie in the capture
+        if source.name in others or source == target.resolve():  # the target may lie in the capture
             continue
         place = target / source.name
         if source.name in TRANSFORMS_NAMES:

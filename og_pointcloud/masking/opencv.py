@@ -8,7 +8,7 @@
 3. Proposals: the persistent regions. A region's score compares the distance at which it was merged away (death) with
    that at which it was made (birth). Regions overlap only by containing one another; `levels` chooses among them.
 
-All lengths are shares of the image's; distances are in 8-bit CIE Lab. Nothing is tuned to a scene.
+All lengths are relative to the image's size; distances are in 8-bit CIE Lab. Nothing is tuned to a scene.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ MIN_SUPERPIXEL_SHARE = 1e-4
 CELL_SHARE = 1 / 40
 """Side of a SLIC cell, as a share of the image's longer side."""
 LIGHTNESS_WEIGHT = 0.5
-"""Relative to the two color channels: shading and shadows change lightness first."""
+"""Relative to the two color channels: shading and shadows mainly change lightness."""
 TEXTURE_WEIGHT = 0.03
 """Color distances are divided by 1 + this times the standard deviation inside the less textured of the two regions."""
 REACH_PX = 2
-"""Contrast is measured this far to either side of a border, which itself is blurred."""
+"""Contrast is measured this far to either side of a border, as the border itself is blurred."""
 SMALL_REGION_SHARE = 4e-3
 """Share of the image: a region of this size is nearer to its neighbors by a factor sqrt(2) than a large one."""
 NOISE_DISTANCE = 5.0
-"""Smaller distances are insignificant: it is added to both sides of the score's ratio."""
+"""Smaller distances are insignificant: this is added to both sides of the score's ratio."""
 MIN_REGION_SHARE, MAX_REGION_SHARE = 4e-4, 0.6
-"""Shares of the image: a smaller region is nothing that a word names, a larger one is the surroundings."""
+"""Shares of the image: a smaller region is too small for a word to name, a larger one is the surroundings."""
 TYPICAL_SHARE = 6e-3
-"""Scores of regions much smaller than this share are lowered: of two as persistent, the larger is the thing."""
+"""Scores of regions much smaller than this share are lowered: of two equally persistent, the larger is the thing."""
 MIN_SCORE = 0.1
 SAME_REGION_SHARE = 0.85
-"""A region with more than this share of an ancestor's area is the same thing; the higher score stays."""
+"""A region with more than this share of an ancestor's area is the same thing; the higher score is kept."""
 MAX_PROPOSALS = 250
-"""Per image, the best by score."""
+"""Per image, those with the best scores."""
 
 
 class OpenCVProposer:
@@ -97,9 +97,9 @@ class RegionTree:
     area: DoubleArray
 
     def runs(self) -> tuple[Labels, Labels]:
-        """An order of superpixels in which every region is a run: (n,) the place of each, (m, 2) first and end."""
-        # Sizes from the leaves up, as parents come after their children; then places from the roots down: each region
-        # takes the next free ones of its parent.
+        """An order of superpixels in which every region is a run: (n,) position of each, (m, 2) first and end."""
+        # Sizes from the leaves up, as parents come after their children; then positions from the roots down: each
+        # region takes the next free ones of its parent.
         leaves = int(self.superpixels.max()) + 1
         size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
         for region, above in enumerate(self.parent.tolist()):
@@ -115,12 +115,12 @@ class RegionTree:
 
     def persistent(self) -> tuple[NDArray[np.intp], FloatArray]:
         """Regions worth a proposal, best first, and their scores in [0, 1)."""
-        death = np.minimum(self.death, 1.5 * self.birth.max())  # as if a root were merged away a little later
+        death = np.minimum(self.death, 1.5 * self.birth.max())  # as if roots were merged away a little later
         share = self.area / self.superpixels.size
         score = 1 - (self.birth + NOISE_DISTANCE) / (np.maximum(death, self.birth) + NOISE_DISTANCE)
         score *= np.sqrt(share / (share + TYPICAL_SHARE))
         kept = (share > MIN_REGION_SHARE) & (share < MAX_REGION_SHARE) & (score > MIN_SCORE)
-        # Of a chain of regions that hardly grow, one stays.
+        # Of a chain of regions that hardly grow, one is kept.
         for region in np.flatnonzero(kept):
             above = self.parent[region]
             while above >= 0 and SAME_REGION_SHARE * self.area[above] < self.area[region]:
@@ -133,7 +133,7 @@ class RegionTree:
 
 
 def region_tree(image: NDArray[np.uint8]) -> RegionTree:
-    """Superpixels of an image (H, W, 3) uint8 RGB, and all regions that they merge into, up to one for the image."""
+    """Superpixels of an image (H, W, 3) uint8 RGB, and all regions that they merge into, up to the whole image."""
     cv2 = require_cv2()
     lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
     lab[:, :, 0] *= LIGHTNESS_WEIGHT
@@ -157,7 +157,7 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
         birth[new] = np.maximum(distance[pairs], np.maximum(birth[number[a]], birth[number[b]]))
         area[new] = regions[a, 0] + regions[b, 0]
         count += len(pairs)
-        # b is merged into a; then current regions are renumbered 0, 1, ..., and their sums and borders gathered.
+        # b is merged into a; then current regions are renumbered 0, 1, ..., and their sums and borders added up.
         number[a] = new
         into = np.arange(len(number))
         into[b] = a
@@ -201,7 +201,7 @@ class _Borders:
         return cls(a, b, np.ones(len(a)), contrast).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
-        """The borders after regions were renumbered by ``into``: borders inside a region are gone, others add up."""
+        """The borders after regions were renumbered by ``into``: borders inside a region are removed, others add up."""
         count = int(into.max()) + 1
         a, b = into[self.a], into[self.b]
         between = a != b
@@ -218,7 +218,7 @@ def _sums(labels: NDArray[np.integer], values: DoubleArray) -> DoubleArray:
 
 
 def _pixel_pairs(labels: Labels, lab: FloatArray) -> Pairs:
-    """For the p pixels whose right neighbor is of another region: both regions, and the contrast there, each (p,)."""
+    """For the p pixels whose right neighbor is in another region: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)
     contrast = np.linalg.norm(lab[row, left] - lab[row, right], axis=1).astype(np.float64)

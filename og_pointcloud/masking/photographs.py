@@ -1,4 +1,4 @@
-"""The posed images of a capture folder, and a sheet of masks drawn on them, to look at before a long run."""
+"""The posed images of a capture folder, and a contact sheet of their masks, to check before a long run."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Photograph:
     """A posed image. name: its view's. path: as in the pose file. file: where it is. camera: from world coordinates.
 
     face: None where masks are made on the image as it is; they are undistorted when they are read. An image that no
-    pinhole can show becomes several photographs, each a face of a cube: models are trained on pinhole images, and the
-    border of a panorama then cuts nothing in two.
+    pinhole can show becomes several photographs, each a face of a cube: models are trained on pinhole images, and no
+    border of a panorama cuts a thing in two.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Photograph:
     face: Face | None = None
 
     def read(self, longest_side: int) -> NDArray[np.uint8]:
-        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Gray, 16-bit and alpha become RGB of 8 bit; EXIF
+        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Gray, 16-bit and alpha become 8-bit RGB; EXIF
         orientation is ignored, as poses ignore it."""
         width, height = image_size(self.file)
         if self.face is not None:
@@ -64,7 +64,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
 
 def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
     whole = image.camera if image.face is None else image.face.whole
-    # Checked here, not when the image's turn comes: a night of work must not end in a wrong size.
+    # Checked here, not when the image is processed: a night of work must not end with a wrong size.
     cure = (
         "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
         "pixels as stored)"
@@ -79,7 +79,7 @@ def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], 
     """A PNG of images in a row, with their masks below. pictures: (H, W, 3) uint8 RGB and (H, W) ids of each."""
     cv2 = require_cv2()
     height, width = pictures[0][1].shape
-    # The first image's size for all: mostly one camera.
+    # The first image's size for all: usually there is one camera.
     size = CELL_WIDTH_PX, max(1, round(2 * CELL_WIDTH_PX * height / width))
     cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in pictures]
     sheet = np.hstack([cv2.resize(cell, size, interpolation=cv2.INTER_AREA) for cell in cells])

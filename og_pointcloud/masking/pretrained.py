@@ -1,7 +1,7 @@
-"""A transformers folder -> its model; nothing but numbers is taken from the folder.
+"""A transformers folder -> its model; only numbers are taken from the folder.
 
-Its config.json must name an accepted type, whose class is transformers' own: code in the folder (auto_map) is ignored.
-Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
+Its config.json must name an accepted type, whose class comes from transformers: code in the folder (auto_map) is
+ignored. Weights are read from .safetensors only, as other files are pickles; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Attention = Literal["eager", "sdpa"]
 
 
 def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attention = "sdpa") -> tuple[Any, str]:
-    """The model in float32, for evaluation, and its model_type.
+    """The model in float32, in evaluation mode, and its model_type.
 
-    classes: model_type -> transformers' class to take. attention: how transformers computes it; "eager" is plain matrix
+    classes: model_type -> class of transformers. attention: how transformers computes it; "eager" is plain matrix
     products, which exports well.
-    SceneError where the folder is of none of these types, or its weights are incomplete.
+    SceneError where the folder has none of these types, or its weights are incomplete.
     """
     kind = _model_type(folder, classes)
     try:
@@ -52,7 +52,7 @@ def best_device() -> torch.device:
 
 
 def read_config(folder: Path, *names: str) -> dict[str, Any]:
-    """The first of these JSON files that a folder has, empty where it has none. SceneError where it holds no object."""
+    """The first of these JSON files that a folder has, empty if it has none. SceneError if it holds no object."""
     file = next((folder / name for name in names if (folder / name).is_file()), None)
     return {} if file is None else read_json_object(file)
 

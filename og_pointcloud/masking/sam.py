@@ -1,8 +1,8 @@
 """SAM, SAM-HQ, SAM 2 and SAM 3 through transformers, without its image processors and without torchvision.
 
-`prepared` does the processors' work in a few lines, with the numbers of the model's ``preprocessor_config.json``: SAM
-and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. SAM 3's tracker half takes points;
-words are in ``sam3``.
+`prepared` replaces the processors, with the numbers of the model's ``preprocessor_config.json``: SAM and SAM-HQ scale
+the longer side and pad, SAM 2 and 3 scale both sides to a square. Points go to SAM 3's tracker half; words are in
+``sam3``.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ HALF_MEAN_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 
 @dataclass(frozen=True)
 class Preparation:
-    """side: pixels of the square that the model takes. padded: the longer side is scaled to it and the rest is 0;
-    else both sides are scaled. mean, std: of channels in [0, 1]."""
+    """side: pixels of the square that the model takes. padded: the longer side is scaled to it and the rest is padded
+    with 0; else both sides are scaled. mean, std: of channels in [0, 1]."""
 
     side: int
     padded: bool
@@ -58,14 +58,14 @@ class LoadedModel:
     preparation: Preparation
 
     def pixels(self, image: NDArray[np.uint8]) -> torch.Tensor:
-        """(H, W, 3) uint8 RGB as the model takes it, `prepared`, on its device."""
+        """(H, W, 3) uint8 RGB -> the model's input, `prepared`, on its device."""
         return prepared(image, self.preparation).to(self.device)
 
 
 def load_sam(name: StrPath, classes: Mapping[str, str]) -> LoadedModel:
-    """A model's folder or a fetched OWNER/MODEL, for evaluation. classes: model_type -> transformers' class to take.
+    """A model's folder or a downloaded OWNER/MODEL, in evaluation mode. classes: model_type -> class of transformers.
 
-    SceneError where there is none of these types, or it cannot be read.
+    SceneError where there is no model of these types, or it cannot be read.
     """
     folder = Path(name).expanduser()
     found = folder if folder.is_dir() else fetched_model(str(name))
@@ -83,7 +83,7 @@ class SamPredictor:
     """A `PointPredictor` on SAM, SAM-HQ, SAM 2 or SAM 3."""
 
     def __init__(self, name: StrPath) -> None:
-        """name: a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
+        """name: a model's folder or a downloaded OWNER/MODEL; SceneError where there is no SAM."""
         self.loaded = load_sam(name, CLASSES)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}
@@ -105,7 +105,7 @@ class SamPredictor:
         preparation, device = self.loaded.preparation, self.loaded.device
         height, width = scaled_size(self.size, preparation)
         scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
-        # Prompts are in pixels of the model's square, to which the image was scaled.
+        # Prompts are in pixels of the model's square input.
         prompts = torch.from_numpy(points * scale)[None, :, None].to(device)  # (images, prompts, points each, xy)
         labels = torch.ones(prompts.shape[:3], dtype=torch.int32, device=device)  # 1: on the thing
         answer = self.loaded.model(input_points=prompts, input_labels=labels, multimask_output=True, **self.encoded)
@@ -125,7 +125,7 @@ def scaled_size(size: tuple[int, int], preparation: Preparation) -> tuple[int, i
 
 
 def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor:
-    """(H, W, 3) uint8 RGB -> (1, 3, side, side) float32 as transformers' own processors make it: bilinear with
+    """(H, W, 3) uint8 RGB -> (1, 3, side, side) float32 as in transformers' own processors: bilinear with
     antialiasing, rounded to 8 bit, scaled to [0, 1], normalized, then padded with 0 to the right and below."""
     pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
     size = scaled_size((image.shape[0], image.shape[1]), preparation)
@@ -137,8 +137,8 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 
 
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
-    """Side from the model's configuration; mean and std from the preprocessor's file if there is one, else those of the
-    published models' training."""
+    """Side from the model's configuration; mean and std from the preprocessor's file if there is one, else those that
+    the published models were trained with."""
     sized = config.vision_config if kind in PADDED_MODELS else getattr(config, "prompt_encoder_config", config)
     side = sized.image_size[0] if isinstance(sized.image_size, (list, tuple)) else sized.image_size
     stated = read_config(folder, "preprocessor_config.json", "processor_config.json")

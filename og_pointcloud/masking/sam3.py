@@ -22,13 +22,13 @@ from og_pointcloud.masking.sam import LoadedModel, load_sam
 from og_pointcloud.text.tokenizer import open_tokenizer
 
 MIN_SCORE = 0.5
-"""Detections need this score, as in transformers' examples. A tracker takes it from its configuration."""
+"""Minimum score of a detection, as in transformers' examples. A tracker takes its own from its configuration."""
 TRACK_IDS_PER_IMAGE = 1 << 32
-"""A run's tracks are numbered from images_before times this on, so that no two runs share a number."""
+"""A run's track numbers start at images_before times this, so that no two runs share a number."""
 
 
 class NamedThings:
-    """A proposer of what words name in a single image."""
+    """A proposer of the things that words name in a single image."""
 
     def __init__(self, name: StrPath, words: Sequence[str]) -> None:
         """name: as for `sam.SamPredictor`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
@@ -42,7 +42,7 @@ class NamedThings:
         seen = model.get_vision_features(pixel_values=self._loaded.pixels(image))
         for tokens in self._tokens:
             answer = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
-            # A query's score: the probability that it is such a thing, times that of the image showing any.
+            # A query's score: the probability that it is such a thing, times that of the image showing one.
             score = (answer.pred_logits.sigmoid() * answer.presence_logits.sigmoid())[0]
             kept = score > MIN_SCORE
             masks.append(answer.pred_masks[0, kept].sigmoid() - 0.5)
@@ -51,14 +51,14 @@ class NamedThings:
 
 
 class FollowedWords:
-    """A proposer of what words name in consecutive images, with the tracks of things."""
+    """A proposer of the things that words name in consecutive images, with their tracks."""
 
     def __init__(self, name: StrPath, words: Sequence[str], images_before: int = 0) -> None:
-        """As `NamedThings`, with a SAM 3 that has its tracker. images_before: how many images earlier runs have done,
-        so that this run's tracks get other numbers than theirs."""
+        """As `NamedThings`, with a SAM 3 that has its tracker. images_before: number of images of earlier runs, so
+        that this run's tracks get other numbers than theirs."""
         self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})
         self._first = images_before * TRACK_IDS_PER_IMAGE
-        # The value that transformers sets where fetching fails; without it, code would be fetched and run.
+        # The value that transformers sets if the download fails; without it, code would be downloaded and run.
         sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
         device, self._step = self._loaded.device, 0
         self._session: Any = transformers.Sam3VideoInferenceSession(
@@ -84,7 +84,7 @@ class FollowedWords:
         return _proposals(torch.cat(masks[1:] or masks), scores, image, self._first + np.array(tracks, np.int64))
 
     def _forget(self) -> None:
-        """Free what lies farther back than the tracker looks: an image takes 12 MB, and each thing in it 1 MB more."""
+        """Free images older than the tracker looks back: each takes 12 MB, plus 1 MB per thing in it."""
         tracker = self._loaded.model.config.tracker_config
         oldest = self._step - max(tracker.max_object_pointers_in_encoder, tracker.num_maskmem)
         self._session.processed_frames.pop(self._step)

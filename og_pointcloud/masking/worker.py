@@ -1,4 +1,4 @@
-"""From an image to an id map and features in a work file that is whole or absent; for one image and for many.
+"""From images to id maps and features, in work files that are written whole or not at all.
 
 Models are opened once. A broken image does not stop the others; a killed run loses only the images in progress.
 """
@@ -35,7 +35,7 @@ class ImageWorker:
     """The models of a run."""
 
     def __init__(self, settings: MaskSettings, done: int = 0) -> None:
-        """done: images that earlier runs have done; tracks do not continue from these."""
+        """done: number of images of earlier runs; tracks do not continue from these."""
         self.settings = settings
         if settings.folder and not settings.words:
             self.proposer = ExistingMasks(settings.folder, settings.tracks)
@@ -68,7 +68,8 @@ class ImageWorker:
 
 
 def read_work(file: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a work file. SceneError where it cannot be read: a disk error, as work files are complete."""
+    """The arrays of a work file. SceneError where it cannot be read: a disk error, as work files are
+    never incomplete."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
@@ -80,7 +81,7 @@ def open_proposer(text: str, words: Sequence[str] = (), images_before: int | Non
     """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``python:MODULE:NAME``, a user's function or proposer
     (`existing.user_proposer`).
 
-    words: what SAM 3 looks for; left out, everything. images_before: with words, track them from image to image, in a
+    words: what SAM 3 looks for; by default everything. images_before: with words, track them from image to image, in a
     run that begins after this many images (`sam3.FollowedWords`).
     Nothing is downloaded. SceneError lists what is known. A folder of masks is not opened here: its masks are found by
     image name (`existing.ExistingMasks`).
@@ -115,8 +116,8 @@ def open_proposer(text: str, words: Sequence[str] = (), images_before: int | Non
 
 
 def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
-    """Each task's error, or None, in the order of the tasks. Without tasks no model is
-    opened. done: images that earlier runs have done."""
+    """Each task's error, or None, in the order of the tasks. Without tasks no model is opened. done: number of images
+    of earlier runs."""
     if tasks:
-        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it waits for the images in progress
+        with ThreadPoolExecutor(settings.threads) as pool:  # on early exit, it waits for the images in progress
             yield from pool.map(ImageWorker(settings, done), tasks)
