@@ -52,7 +52,7 @@ class BlockInterval(Interval):
 def bootstrap(scores: NDArray[np.floating]) -> Interval:
     """Interval of the mean of n items' scores (scenes, or frame-object pairs), resampled with replacement.
 
-    An item with NaN has no score and is left out first. A single item has no spread; no item is an error.
+    An item that is not finite has no score and is left out first. A single item has no spread; no item is an error.
     """
     values = np.asarray(scores, np.float64)
     values = values[np.isfinite(values)]

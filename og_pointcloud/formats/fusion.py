@@ -84,7 +84,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class FusedCloud:
-    """points: with colors if every frame has them. frames: number fused. refused: number of voxels that other views
+    """points: with colors if every frame has them. frames: number given. refused: number of voxels that other views
     looked through or that only one saw. empty: names of frames in which nothing was measured."""
 
     points: Points
