@@ -21,7 +21,7 @@ arguments = parser.parse_args()
 labels = arguments.labels.split(",") if arguments.labels else None
 arguments.output.mkdir(parents=True, exist_ok=True)
 
-# Any points in the scene's frame, here its own with a little noise: a label, a score and an instance each.
+# Any points in the scene's frame, here its own with a little noise: each gets a label, a score and an instance.
 scene = og.load(arguments.scene)
 points = scene.xyz + np.random.default_rng(0).normal(scale=0.2 * scene.cloud.spacing, size=scene.xyz.shape)
 result = og.segment(points, labels, scene)
@@ -33,7 +33,7 @@ print("unknown:", ", ".join(f"{count:,} {reason}" for reason, count in result.un
 # The same from PyVista: nothing to import, og_pointcloud is found through its entry points.
 mesh: Any = pv.PolyData(points).og.segment(labels, scene)
 if scene.cloud.rgb is not None:
-    mesh["RGB"] = scene.cloud.rgb  # a dataset's own colors shade those of its labels
+    mesh["RGB"] = scene.cloud.rgb  # a dataset's own colors shade the label colors
 assert np.array_equal(mesh["og_label"], result.labels)
 mesh.save(arguments.output / "labels.vtp")  # names and the scene's path travel with it
 

@@ -18,12 +18,12 @@ parser.add_argument("-o", "--output", type=Path, default=Path("out/02"), metavar
 arguments = parser.parse_args()
 arguments.output.mkdir(parents=True, exist_ok=True)
 
-# The table: where each instance is, how large, what it looks like; boxes stand upright on z.
+# The table: where each instance is, its size, what it looks like; boxes are upright along z.
 table = og.instance_table(arguments.scene, up=(0, 0, 1))
 print(table)
 table.to_csv(arguments.output / "instances.csv")
 
-# The same as datasets: PyVista's own verb makes a block an instance, named by its id here.
+# The same as datasets: PyVista's own method makes one block per instance, here named by its id.
 mesh: Any = pv.read(arguments.scene).og.segment()
 blocks = mesh.split_values({str(row.id): row.id for row in table if row.points}, scalars="og_instance")
 largest = max(blocks.keys(), key=lambda name: blocks[name].n_points)

@@ -34,7 +34,7 @@ if arguments.show:
     plotter.show()
     raise SystemExit
 
-# Click on the frontmost point of an instance, of the largest one that nothing hides there.
+# Click on the frontmost point of the largest instance that nothing hides there.
 plotter.show(auto_close=False)
 plotter.screenshot(arguments.output / "before.png")
 toward_eye = np.asarray(plotter.camera.position) - np.asarray(plotter.camera.focal_point)

@@ -16,10 +16,10 @@ parser.add_argument("--labels", required=True, metavar="A,B,C")
 parser.add_argument("-o", "--output", type=Path, default=Path("painted.ply"), metavar="P.ply")
 arguments = parser.parse_args()
 
-cloud = og3.read(arguments.cloud)  # where Open3D would return an empty cloud, this says why
+cloud = og3.read(arguments.cloud)  # raises an error with the reason where Open3D would return an empty cloud
 painted, result = og3.segment(cloud, arguments.labels.split(","), arguments.scene)
 
-# Open3D's own verbs keep the labels: they are attributes (N, 1) of the tensor cloud.
+# Open3D's own operations keep the labels: they are attributes (N, 1) of the tensor cloud.
 thinned = painted.voxel_down_sample(0.05)
 first = result.names[0]
 mine = thinned.select_by_mask(thinned.point["og_label"].flatten() == 0)

@@ -33,7 +33,7 @@ scene, splats = og.load(arguments.scene), og.read_points(arguments.splats)
 selection = og.select(scene, arguments.word)
 print(selection)
 
-# Each Gaussian takes the instance of the nearest point; what the word means turns red, all else fades to light gray.
+# Each Gaussian takes the instance of the nearest point; instances that fit the word turn red, the rest light gray.
 found = np.isin(scene.instances_at(splats.xyz_world), selection.instances)
 rgb = np.asarray(splats.rgb, np.float32)
 pale = 150 + 0.35 * (rgb @ LUMINANCE)[:, None].repeat(3, axis=1)

@@ -32,7 +32,7 @@ names = json.loads(record.record_data_bytes())
 for label, name in enumerate(names):
     print(f"{name}: {(las.og_label == label).sum()} points, class {64 + label}")
 
-# The .glb is a cloud of colored points wherever it is opened; here it is asked again, in the same coordinates.
+# The .glb opens anywhere as a cloud of colored points; here it is labelled again, in the same coordinates.
 again = og.segment(trimesh.load_scene(glb).to_geometry(), names, arguments.scene)
 print(f"{(again.labels == result.labels).mean():.2%} of labels agree after a round trip through float32")
 print(f"wrote {laz} and {glb}")

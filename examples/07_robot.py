@@ -2,8 +2,8 @@
 
 python examples/07_robot.py -o OUT [--scene room.ogpc] [--frames N]
 
-Writes 07_robot.png, the drive as a bag, and the bag with labels. Since mapping a chair was moved, and two things are
-new: they should be unknown.
+Writes 07_robot.png, the drive as a bag, and the bag with labels. Since mapping, a chair was moved and two things are
+new: these should be unknown.
 """
 
 import argparse
@@ -36,7 +36,7 @@ scene = og.load(arguments.scene)
 segmenter = og.Segmenter(scene, CLASS_NAMES)
 instances = og.instance_table(scene, up=(0, 0, 1))
 drive, log, streamed = Drive(0, frames=arguments.frames), DriveLog(), []
-# Boxes, and the lookup of places between points, are made when first asked for: now, so that no frame waits for them.
+# Boxes, and the lookup of places between points, are built on first use: here, so that no frame waits for them.
 _ = [row.oriented_box for row in instances], segmenter(scene.xyz + scene.cloud.reach / 2)
 for frame in drive:
     start = time.perf_counter()

@@ -17,7 +17,7 @@ parser.add_argument("-o", "--output", type=Path, default=Path("out/09"), metavar
 arguments = parser.parse_args()
 arguments.output.mkdir(parents=True, exist_ok=True)
 
-# Scores say whether an instance is what the word means, certainty whether the point is part of the instance.
+# Scores tell whether the word fits an instance, certainty whether the point is part of that instance.
 result = og.segment(arguments.scene)
 if result.certainty is None:
     raise SystemExit(f"{arguments.scene} does not know how sure its points are: fit the capture again")
@@ -32,7 +32,7 @@ if not can_render():
     raise SystemExit("VTK cannot draw here: install libegl1 or libosmesa6")
 mesh: Any = result.to_pyvista()
 unsure: Any = mesh.copy()
-unsure["og_label"] = np.where(sure, result.labels, -1)  # what is not sure becomes unknown
+unsure["og_label"] = np.where(sure, result.labels, -1)  # uncertain points become unknown
 plotter: Any = pv.Plotter(off_screen=True, window_size=[1800, 900], shape=(1, 2))
 bar = {"title": "certainty", "vertical": True, "fmt": "%.1f", "n_labels": 3}
 plotter.add_mesh(pv.PolyData(mesh.points), scalars=result.certainty, clim=(0, 1), point_size=4, scalar_bar_args=bar)

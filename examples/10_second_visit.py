@@ -34,7 +34,7 @@ camera = Viewpoint(np.array([-0.3, -0.75, 1.75]) * room, 0.2 * up, up).camera(*S
 
 
 def drawn(scene: og.LabelledScene, rgb: np.ndarray, size: tuple[int, int] = SIZE) -> np.ndarray:
-    """The room from above, without its ceiling and the walls before the eye. rgb: (n, 3), 0 to 255."""
+    """The room from above, without its ceiling and the walls in front of the eye. rgb: (n, 3), 0 to 255."""
     x, y, z = scene.xyz.T
     shown = (x > 0.08 - room[0] / 2) & (y > 0.08 - room[1] / 2) & (z < room[2] - 0.3)
     points = Points(scene.cloud.xyz[shown], scene.cloud.origin)
@@ -50,7 +50,7 @@ def tinted(scene: og.LabelledScene, tints: Mapping[int, Sequence[int]]) -> np.nd
 
 
 def written(image: np.ndarray, entry: MapObject, what: str, color: tuple[int, int, int]) -> None:
-    """Writes above an object what it is, and what became of it."""
+    """Writes above an object what it is, and what happened to it."""
     ((u, v),), _ = camera.project(np.array([[*entry.place[:2], entry.box.high[2] + 0.05]]))
     text = f"{name_of(entry)} {what}"
     for thickness, shade in ((6, (255, 255, 255)), (2, color)):
@@ -58,7 +58,7 @@ def written(image: np.ndarray, entry: MapObject, what: str, color: tuple[int, in
 
 
 def name_of(entry: MapObject) -> str:
-    """The word that fits it best."""
+    """The word that fits an object best."""
     return NAMES[int((days.model.texts @ np.asarray(entry.descriptor)).argmax())]
 
 
@@ -75,7 +75,7 @@ for number, frame in enumerate(days.before, 1):
 write_png(out / "growing.png", np.hstack(strip))
 monday, before = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
 
-# Tuesday: the same mapper goes on. Objects keep their ids, so that two lists of them tell what became of each.
+# Tuesday: the same mapper goes on. Objects keep their ids, so that two lists of them show what happened to each.
 for frame in days.after:
     mapper.integrate(frame)
 tuesday, after = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
@@ -84,7 +84,7 @@ gone = [k for k in before if k in after and after[k].state == "gone"]
 moved = [k for k in before if k in after and after[k].state == "moved"]
 new = [k for k in after if k not in before and start <= after[k].since < np.inf]
 
-# Left what is gone, as Monday saw it; right what is new or was moved, as Tuesday sees it.
+# Left: what is gone, as seen on Monday. Right: what is new or was moved, as seen on Tuesday.
 left = drawn(monday, tinted(monday, dict.fromkeys(gone, GONE)))
 right = drawn(tuesday, tinted(tuesday, dict.fromkeys(new, NEW) | dict.fromkeys(moved, MOVED)))
 for k in gone:

@@ -2,7 +2,7 @@
 
 python examples/11_paper_figures.py CAPTURE WORD -o OUT    writes features.png and objects.png
 
-objects.png has mode paper above the default way. The click is on what the default way calls WORD.
+objects.png has mode paper above the default mode. The click is on what the default mode calls WORD.
 """
 
 import argparse
@@ -35,7 +35,7 @@ out.mkdir(parents=True, exist_ok=True)
 scene = og.read_capture(arguments.capture)
 words, _ = og.read_text_features(arguments.capture / "text_features.npz")
 
-# Mode paper: a fit returns no features. Training again with the same work folder finds the checkpoint of the last step.
+# Mode paper: a fit returns no features. Training with the same work folder continues from its last checkpoint.
 settings = FitSettings(mode="paper", paper=PaperSettings(schedule_share=arguments.share))
 journal = Journal(progress=True)
 prepared = prepare(scene, settings, journal)
@@ -45,7 +45,7 @@ with WorkFolder.open(out / "training.work") as work:
     features, book = trained_by_rendering(prepared.table, surface, settings, journal, work)
 default = clouds["default"] = og.fit(scene)
 
-# Features as colors in four views and from above, three stages below each other; NaN, for points without any, is gray.
+# Features as colors in four views and from above, one row per stage; NaN, for points without features, is gray.
 features, shown, leaves = map(surface.of_points, (features, book.leaf >= 0, book.centers[book.leaf]))
 ids, of_instances = default.instance_ids, np.full_like(features, np.nan)
 for k in np.unique(ids[shown & (ids >= 0)]):
@@ -61,7 +61,7 @@ height, width = scene.views[0].camera.height, scene.views[0].camera.width
 camera = viewpoint.camera(width, height, FOCAL * height / 2)
 views = [scene.views[index] for index in np.linspace(0, len(scene.views) - 1, 4).astype(int)]
 views.append(View("from above", camera, np.full((height, width), -1, np.int32), np.zeros((0, 1), np.float32)))
-# Points are drawn all alike: where strays lie far apart, the Gaussians of the method are as large as furniture.
+# Points are all drawn the same size: where strays lie far apart, the method's Gaussians are as large as furniture.
 splats = as_splats(scene.points, default.spacing)
 # The three principal directions of the features, three standard deviations wide each, become red, green and blue.
 known = features[shown]
@@ -82,14 +82,14 @@ for title, of_points in stages.items():
     cv2.putText(rows[-1], title, (10, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
 write_png(out / "features.png", np.vstack(rows))
 
-# A click on the middle of the word's thing, in the view that shows most of it and all that lies around it.
+# A click on the middle of the word's thing, in the view that shows most of it with its surroundings.
 best = og.select(default, {arguments.word: words.vectors[words.names.index(arguments.word)]}).best
 if best is None:
     raise SystemExit(f"the default way finds no {arguments.word}; take another of {', '.join(words.names)}")
 cameras = [og.in_world(view.camera, scene.points.origin) for view in scene.views]
 thing = og.pick(default, default.xyz_world[ids == best.instance][0])
 masks = [thing.mask(camera) for camera in cameras]
-# A view that cuts the thing off at its border counts a tenth of its pixels.
+# Pixels count a tenth in a view that cuts the thing off at its border.
 inside = [mask[1:-1, 1:-1].sum() == mask.sum() for mask in masks]
 most = int(np.argmax([mask.sum() * (1 if whole else 0.1) for mask, whole in zip(masks, inside, strict=True)]))
 camera, inner = cameras[most], cv2.distanceTransform(np.pad(masks[most], 1).astype(np.uint8), cv2.DIST_L2, 3)

@@ -1,13 +1,13 @@
-"""Has it become slower, or less exact? This tree beside another revision, run in turn: `make bench [AGAINST=REV]`.
+"""Has it become slower, or less exact? This tree against another revision, run in turn: `make bench [AGAINST=REV]`.
 
-    python examples/bench.py                  # beside HEAD where there are changes, else beside the last tag or HEAD~1
+    python examples/bench.py                  # against HEAD if there are changes, else the last tag or HEAD~1
     python examples/bench.py --against v1.0 --rounds 9
 
 The other revision is checked out into a temporary folder. Each round is a fresh process of A (the other), then one of B
-(this tree), on the same files; a first round, which compiles, is discarded. Printed are medians, the ratio B / A with
+(this tree), on the same files; the first round, which compiles, is discarded. It prints medians, the ratio B / A with
 its range over the rounds, and the errors of both:
 
-    kernel        one view of 100,000 Gaussians, seconds of one core; largest weight error against float64, relative
+    kernel        one view of 100,000 Gaussians, seconds of one core; largest relative weight error against float64
     fit           a capture of a furnished room; 1 - adjusted Rand index against the room's own instances
     write         that fit as a .ogpc; share of points whose instance differs when it is read back
     first answer  import, load and label 1,000 points; share of instances that differ from the file's
@@ -117,20 +117,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def git(*arguments: str) -> str:
-    """What git prints in this tree."""
+    """The output of git in this tree."""
     command = ["git", "-C", str(ROOT), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def default_revision() -> str:
-    """HEAD where the tree has changes; else the last tag before it, or the commit before."""
+    """HEAD if the tree has changes; else the last tag before it, or the previous commit."""
     if git("status", "--porcelain", "--untracked-files=no"):
         return "HEAD"
     return git("tag", "--merged", "HEAD~1", "--sort=-creatordate").partition("\n")[0] or "HEAD~1"
 
 
 def write_files(folder: Path) -> np.ndarray:
-    """What both revisions read: a room's capture, and a view for the kernel with its float64 answer in a window.
+    """Write what both revisions read: a room's capture, and a view for the kernel with its float64 result in a window.
     Returns the instance of each of the room's points."""
     from benchmark_visibility import Case, reference_of, room_case, window_of
     from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture
@@ -168,7 +168,7 @@ def measure(tree: Path, folder: Path, truth: np.ndarray) -> tuple[dict[str, floa
 
 
 def print_table(rounds: Sequence[Sequence[dict[str, dict[str, float]]]]) -> None:
-    """A row a piece. rounds: of A and B each "seconds" and "error" by piece."""
+    """One row per piece. rounds: for each of A and B "seconds" and "error" by piece."""
     print(f"{'':<14} {'A, s':>9} {'B, s':>9} {'B / A':>6} {'range':>12} {'A, error':>9} {'B, error':>9}")
     for name in PIECES:
         if not all(name in of["seconds"] for both in rounds for of in both):

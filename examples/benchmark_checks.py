@@ -1,13 +1,13 @@
-"""Faults made one at a time in right captures: which are told, by which check, and what the named repair brings.
+"""Faults added one at a time to correct captures: which are detected, by which check, and what the named repair gains.
 
     python examples/benchmark_checks.py CAPTURE [CAPTURE ...] [--fit] [--only FAULT ...] [--good]
 
-A capture is a folder with transforms.json, points.ply, masks/, mask_features.npz and images/. For every fault a folder
-of links is made in a temporary place, with the faulty file in it; lengths are shares of the median distance to the
-cameras. ``told by`` is "refused" where reading or fitting ends in an error, else the checks in doubt; ``repair`` is
-what they name, repaired and checked again at most twice. With --fit each is fitted and scored against ``gt.npz``, with
-the fault and with the repair. --good: only the captures as they are, where a doubt is a false alarm, and what the
-checks cost beside a fit.
+A capture is a folder with transforms.json, points.ply, masks/, mask_features.npz and images/. For every fault, a
+temporary folder of links is made with the faulty file in it; lengths are shares of the median distance to the cameras.
+``told by`` is "refused" where reading or fitting ends in an error, else the checks in doubt; ``repair`` is what they
+name, repaired and checked again at most twice. With --fit each is fitted and scored against ``gt.npz``, with the fault
+and with the repair. --good: only the captures as they are, where a doubt is a false alarm, and the cost of the checks
+compared with a fit.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 ROUNDS = 2
 CURED = 3
-"""Percent of mIoU below that of the right capture up to which a repair has cured a fault."""
+"""A fault counts as cured if the repaired mIoU is at most this many percent below that of the correct capture."""
 TEXT, FEATURES = "text_features.npz", "mask_features.npz"
 Fault = Callable[[Path], None]
 Maps = list[NDArray[Any]]
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--fit", action="store_true")
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def table(capture: Path, names: Sequence[str], fitted: bool) -> None:
-    """A line for each fault, and how many are told, named, and cured."""
+    """Print a line for each fault, and how many are detected, have a named repair, and are cured."""
     right = judged(capture, [], True)[0] if fitted else None
     beside = "" if right is None else f", {right:.1f} as it is"
     print(f"{capture.name}{beside}\n{'fault':<33} {'told by':<28} {'repair':<52} {'mIoU':>6} {'repaired':>9}")
@@ -97,7 +97,7 @@ class Found(NamedTuple):
 
 
 def found_of(capture: Path, folder: Path, name: str, fitted: bool) -> Found:
-    """What is found of one fault; folder: where the faulty capture is made."""
+    """What the checks find of one fault. folder: where the faulty capture is made."""
     link(capture, folder)
     repairs: list[str] = []
     FAULTS[name](folder)
@@ -119,7 +119,7 @@ def found_of(capture: Path, folder: Path, name: str, fitted: bool) -> Found:
 
 
 def judged(folder: Path, repairs: tuple[str, ...] | list[str], fitted: bool) -> tuple[float | None, list[str]]:
-    """mIoU in percent of a fit of the folder, None without one; the names of the checks in doubt."""
+    """mIoU in percent of a fit of the folder, None without a fit; the names of the checks in doubt."""
     scene = og.read_capture(folder, repairs=repairs)
     if not fitted:
         return None, [check.name for check in check_capture(scene) if check.verdict == "doubt"]
@@ -137,7 +137,7 @@ def with_words(cloud: LabelledCloud, folder: Path) -> LabelledCloud:
 
 
 def false_alarms(captures: list[Path], fitted: bool) -> None:
-    """Verdicts on captures as they are, with the processor seconds of the checks, and of the fit about them."""
+    """Print verdicts on captures as they are, with the processor seconds of the checks, and of the whole fit."""
     alarms = 0
     for capture in captures:
         scene = og.read_capture(capture)
@@ -161,7 +161,7 @@ def false_alarms(captures: list[Path], fitted: bool) -> None:
 
 
 def link(capture: Path, folder: Path) -> None:
-    """A folder of links to what a capture has."""
+    """A folder of links to a capture's files."""
     folder.mkdir(parents=True)
     for part in capture.resolve().iterdir():
         (folder / part.name).symlink_to(part)
@@ -191,7 +191,7 @@ def transforms(change: Callable[[dict[str, Any]], None]) -> Fault:
 
 
 def poses(change: Callable[[Maps, int], NDArray[Any]]) -> Fault:
-    """A fault of poses; change: of all matrices, and the index of one, to that one."""
+    """A fault of poses; change: (all matrices, index of one) -> that one, changed."""
 
     def edit(content: dict[str, Any]) -> None:
         matrices = [np.array(frame["transform_matrix"], float) for frame in content["frames"]]
@@ -202,7 +202,7 @@ def poses(change: Callable[[Maps, int], NDArray[Any]]) -> Fault:
 
 
 def numbers(keys: str, change: Callable[[float], float]) -> Fault:
-    """A fault of numbers in transforms.json, at its top or in frames."""
+    """A fault of numbers in transforms.json, at top level or in frames."""
 
     def edit(content: dict[str, Any]) -> None:
         for level in (content, *content["frames"]):
@@ -212,7 +212,7 @@ def numbers(keys: str, change: Callable[[float], float]) -> Fault:
 
 
 def cloud(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]) -> Fault:
-    """change: of points (n, 3), given their median distance to the first camera."""
+    """A fault of the cloud; change: (points (n, 3), their median distance to the first camera) -> points."""
 
     def fault(folder: Path) -> None:
         points = read_points(folder / "points.ply")
@@ -226,7 +226,7 @@ def cloud(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]) -
 
 
 def pictures(part: str, change: Callable[[Maps, int], NDArray[Any]]) -> Fault:
-    """A fault of masks or photographs; change: of all, and the index of one, to that one."""
+    """A fault of masks or photographs; change: (all images, index of one) -> that one, changed."""
 
     def fault(folder: Path) -> None:
         files = sorted(own(folder, part).iterdir())
@@ -238,7 +238,7 @@ def pictures(part: str, change: Callable[[Maps, int], NDArray[Any]]) -> Fault:
 
 
 def arrays(name: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Fault:
-    """A fault of text_features.npz or mask_features.npz; change: of all that it holds."""
+    """A fault of text_features.npz or mask_features.npz; change: of all its arrays."""
 
     def fault(folder: Path) -> None:
         path = own(folder, name)
@@ -248,7 +248,7 @@ def arrays(name: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Fau
 
 
 def features(change: Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]) -> Fault:
-    """A fault of the mask features; change: of the rows of an image."""
+    """A fault of the mask features; change: of one image's rows."""
 
     def of_all(rows: dict[str, Any]) -> dict[str, Any]:
         random = np.random.default_rng(0)
@@ -258,7 +258,7 @@ def features(change: Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
 
 
 def together(*faults: Fault) -> Fault:
-    """Several faults as one."""
+    """Several faults combined into one."""
 
     def fault(folder: Path) -> None:
         for each in faults:
@@ -314,12 +314,12 @@ def rotated(z_degrees: float) -> NDArray[np.float64]:
 
 
 def resized(map_: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
-    """Resized as photographs are, which ids must not be."""
+    """Resized like a photograph, which is wrong for ids."""
     return cv2.resize(map_, size, interpolation=cv2.INTER_LINEAR)
 
 
 def through_jpeg(map_: NDArray[Any]) -> NDArray[Any]:
-    """Ids that were stored with losses."""
+    """Ids stored with lossy compression."""
     return np.asarray(cv2.imdecode(cv2.imencode(".jpg", (map_ * 10).astype(np.uint8))[1], -1)) // 10
 
 
@@ -330,7 +330,7 @@ def in_capitals(content: dict[str, Any]) -> None:
 
 
 def exchanged(content: dict[str, Any]) -> None:
-    """cx and cy in each other's place."""
+    """cx and cy swapped."""
     for level in (content, *content["frames"]):
         if "cx" in level:
             level["cx"], level["cy"] = level["cy"], level["cx"]
@@ -412,10 +412,10 @@ PAIRS = (
     ("poses of next frame", "K halved"), ("cloud in mm", "features shuffled"), ("masks of next image", "ids from 0"),
     ("moved by 4 %", "ids from 0"), ("turned 5 degrees", "cx, cy swapped"), ("poses shuffled", "masks turned"),
 )  # fmt: skip
-"""Mistakes that come together."""
+"""Mistakes that occur together."""
 FAULTS |= {f"{one} + {other}": together(FAULTS[one], FAULTS[other]) for one, other in PAIRS}
 HARMLESS = ("none", "a NaN pose", "two identity poses", "COLMAP")
-"""Not faults, or such that a fit leaves out."""
+"""Not faults, or faults that a fit leaves out."""
 
 
 if __name__ == "__main__":

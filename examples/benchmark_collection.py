@@ -1,12 +1,12 @@
-"""An atlas of many made scenes: seconds to index and to ask, memory, and how exact the answers are.
+"""An atlas of many made scenes: seconds to index and to query, memory, and how exact the answers are.
 
     python examples/benchmark_collection.py                     # 1,000 scenes as files, then 1,000,000 descriptors
     python examples/benchmark_collection.py --descriptors 0     # only the files
     python examples/benchmark_collection.py --files 0 --lance   # LanceDB beside the exact search, recall at 10
     python examples/benchmark_collection.py --captures CAPTURE...   # the right scene first?
 
-Descriptors are drawn about the vectors of made-up words, as an encoder's would be: near a word, with what all images
-share and noise. Every figure that is printed is of this run.
+Descriptors are drawn around the vectors of made-up words, as an encoder's would be: near a word, with a part that all
+images share, and noise. All printed figures are from this run.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ SEEN = {
     ("sofa", "hololens_office"): "the truth's word is couch",
     ("bottle", "desk_colmap29"): "a glass drinking bottle before the laptop, open, which the truth leaves out",
 }
-"""Things that photographs show and the truth does not name so, looked at by hand: word and scene, why. Looked at
-and not so: seven_redkitchen's laptop is a white panel on the sink, hololens_office's bowl a cup on a saucer."""
+"""Things that photographs show but the truth does not name, checked by eye: word and scene, why. Checked and rejected:
+seven_redkitchen's laptop is a white panel on the sink, hololens_office's bowl a cup on a saucer."""
 
 
 class MadeEncoder:
-    """Vectors of words, and of what masks show of things."""
+    """Vectors of words, and of masks of things."""
 
     def __init__(self, width: int, rng: np.random.Generator) -> None:
         self.rng, self.shared = rng, unit_rows(rng.normal(size=(1, width)))[0]
@@ -56,7 +56,7 @@ class MadeEncoder:
 
 
 def main() -> None:
-    """All tables that are asked for."""
+    """Print the requested tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--files", type=int, default=1000, help="scenes that are written as .ogpc files and indexed")
     parser.add_argument("--descriptors", type=int, default=1_000_000)
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def files(folder: Path, count: int, instances: int, encoder: MadeEncoder) -> None:
-    """Index files, ask them, change some."""
+    """Index files, query them, change some."""
     start = time.perf_counter()
     for number in range(count):
         og.write_bundle(cloud(number, instances, encoder), folder / "scans" / f"room{number:04d}.ogpc")
@@ -105,7 +105,7 @@ def files(folder: Path, count: int, instances: int, encoder: MadeEncoder) -> Non
 
 
 def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud:
-    """A room of things that are 20 points each."""
+    """A room of things of 20 points each."""
     rng = np.random.default_rng(number)
     xyz = rng.random((instances, 1, 3)) * [20, 20, 3] + 0.3 * rng.random((instances, 20, 3))
     ids = np.repeat(np.arange(instances, dtype=np.int32), 20)
@@ -117,8 +117,8 @@ def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud
 
 
 def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, with_lance: bool) -> None:
-    """An atlas written from arrays; the exact search, and LanceDB beside it, which is opened first: what the exact one
-    has held would stay with the process."""
+    """An atlas written from arrays; the exact search beside LanceDB, which is opened first, as memory that the exact
+    search has used would stay with the process."""
     path = folder / "large"
     seconds, cpu, _ = timed(lambda: write_atlas(path, descriptors, instances, encoder))
     print(
@@ -142,7 +142,7 @@ def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table. seconds, cpu, found: of each word; memory: bytes that asking has taken so far."""
+    """A row of the table. seconds, cpu, found: for each word; memory: bytes that queries have taken so far."""
 
     name: str
     asked: str
@@ -153,7 +153,7 @@ class Row:
 
 
 def rows_of(name: str, opened: Callable[[], og.Collection]) -> list[Row]:
-    """The rows of one way to search: of everything, of half of the place, and of one scene."""
+    """The rows of one search method: over everything, over half of the area, and over one scene."""
     before = memory_in_use()
     collection = opened()
     seconds, cpu, _ = timed(lambda: collection.find("thing 0"))
@@ -186,7 +186,7 @@ def lance_rows(path: Path, folder: Path) -> list[Row]:
 
 
 def right_scenes(captures: list[Path], fitted: Path) -> None:
-    """Ask all captures for each word of which one has 30 points or more: does such a one come first?"""
+    """Query all captures for each word that one has 30 points or more of: does such a capture come first?"""
     fits = og.fit_many(captures, fitted)
     assert all(fit.state != "failed" for fit in fits), [fit.cause for fit in fits]
     collection = og.Collection.index(fitted, fitted.with_suffix(".atlas"), progress=False)
@@ -206,7 +206,7 @@ def right_scenes(captures: list[Path], fitted: Path) -> None:
 
 
 def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncoder) -> None:
-    """Scenes on a square kilometer, each of ten meters."""
+    """Scenes on a square kilometer, each ten meters wide."""
     with Atlas.writing(path) as atlas:
         atlas.note("root", str(path.parent.resolve()))
         words = atlas.add_words(encoder.words.names, encoder.words.vectors)
@@ -219,7 +219,7 @@ def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncod
 def made_scenes(
     descriptors: int, instances: int, encoder: MadeEncoder
 ) -> Iterator[tuple[og.InstanceTable, NDArray[np.float64]]]:
-    """Scenes of so many instances, one descriptor each, and the corners of their boxes."""
+    """Scenes with this many instances, one descriptor each, and the corners of their boxes."""
     twenty, ratios = np.full(instances, 20, np.int32), np.full(instances, 0.9, np.float32)
     for _ in range(descriptors // instances):
         low = np.append(encoder.rng.random(2) * 990, 0) + encoder.rng.random((instances, 3)) * [10, 10, 3]
@@ -230,7 +230,7 @@ def made_scenes(
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, float, Any]:
-    """Seconds, those of all cores together, which other programs do not lengthen, and the value."""
+    """Wall-clock seconds; processor seconds of all cores, which other programs do not lengthen; and the value."""
     start, start_cpu = time.perf_counter(), time.process_time()
     value = function()
     return time.perf_counter() - start, time.process_time() - start_cpu, value

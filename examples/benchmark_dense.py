@@ -1,11 +1,11 @@
-"""What describing an image's masks costs by crops and by dense pooling, in torch and exported: a CLIP of B/16's size
+"""The cost of describing an image's masks by crops and by dense pooling, in torch and exported: a CLIP of B/16's size
 with random weights.
 
     python examples/benchmark_dense.py [--masks 4 16 64]
 
 Processor seconds of all cores together, and the largest difference of an entry of the unit vectors between torch and
-the exported graph. Random weights say nothing of what the vectors mean; that all are the model's own parts is tested
-(tests/test_dense_features.py, test_encoders.py).
+the exported graph. With random weights the vectors mean nothing; that they are computed from the model's own parts is
+tested (tests/test_dense_features.py, test_encoders.py).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def boxes(count: int) -> NDArray[np.bool_]:
 
 
 def run(encoder: MaskEncoder, masks: NDArray[np.bool_]) -> tuple[float, NDArray[np.float32]]:
-    """Seconds of the processor for one image, and the vectors."""
+    """Processor seconds for one image, and the vectors."""
     image = np.random.default_rng(1).integers(0, 256, (*SIZE, 3), np.uint8)
     start = time.process_time()
     vectors = encoder.embed(image, masks)
@@ -48,7 +48,7 @@ def run(encoder: MaskEncoder, masks: NDArray[np.bool_]) -> tuple[float, NDArray[
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--masks", type=int, nargs="+", default=[4, 16, 64])
     options = parser.parse_args(arguments)
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"{'masks':>6} {'features':<8} {'torch s':>9} {'exported s':>11} {'difference':>11}")
     for name, in_torch, light in zip(FEATURES, (CropEncoder(model), DenseEncoder(model)), light_ones, strict=True):
         for encoder in (in_torch, light):
-            run(encoder, boxes(1))  # which loads what is loaded once
+            run(encoder, boxes(1))  # one-time loading
         for count in options.masks:
             masks = boxes(count)
             (slow, expected), (fast, found) = run(in_torch, masks), run(light, masks)

@@ -1,8 +1,8 @@
-"""Faults made one at a time in a right room's depth images: how far the views agree, and what is said of them.
+"""Faults added one at a time to a correct room's depth images: how far the views agree, and what the check reports.
 
     python examples/benchmark_depth_checks.py [SEED ...]
 
-The room is the demo's, of the seeds given (0), in 24 views of 320 x 240 whose depth ends at 3.5 m, as a sensor's does.
+The room is the demo's, of the given seeds (0), in 24 views of 320 x 240 whose depth ends at 3.5 m, like a sensor's.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ CAMERAS: dict[str, Callable[[Camera], Camera]] = {
 
 
 def main(seeds: list[int]) -> None:
-    """A line a fault: what is said of it, or nothing."""
+    """Print a line per fault: what the check reports, or nothing."""
     for seed in seeds:
         made = make_capture(seed, CaptureSettings(views=24, width=320, height=240, samples_per_view=20_000))
         depth = np.stack([np.where(frame.depth_m < FARTHEST_M, frame.depth_m, 0) for frame in made.frames])
@@ -66,7 +66,7 @@ def main(seeds: list[int]) -> None:
 
 
 def said_of(depth: Depth, cameras: list[Camera]) -> str:
-    """What the check says of depth images (V, H, W) in meters with these cameras."""
+    """What the check reports of depth images (V, H, W) in meters with these cameras."""
     with tempfile.TemporaryDirectory() as folder:
         frames = []
         for number, (image, camera) in enumerate(zip(depth, cameras, strict=True)):

@@ -1,5 +1,5 @@
-"""Many made captures through two Dask workers of this machine, one of which is killed in the middle, and one capture
-that is broken: what comes of it, beside the same captures fitted one after another.
+"""Many made captures, one of them broken, fitted on two local Dask workers, one of which is killed midway: the outcome,
+compared with the same captures fitted one after another.
 
     PYTHONPATH=tests python examples/benchmark_fit_many.py --captures 24
 """
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def make(folder: Path, count: int) -> list[Path]:
-    """Captures of 3 to 8 views, the third without cameras that can be read."""
+    """Captures of 3 to 8 views, the third without readable cameras."""
     from scenes import write_tiny_capture  # pyright: ignore[reportMissingImports]
 
     captures = [write_tiny_capture(folder / f"room{k:02d}", 3 + k % 6).folder for k in range(count)]
@@ -56,7 +56,7 @@ def make(folder: Path, count: int) -> list[Path]:
 
 
 def on_cluster(captures: list[Path], out: Path) -> tuple[og.CaptureFit, ...]:
-    """Fit on two workers and kill one of them when it has begun."""
+    """Fit on two workers and kill one of them when work has begun."""
     from distributed import Client, LocalCluster
 
     with (
@@ -68,7 +68,7 @@ def on_cluster(captures: list[Path], out: Path) -> tuple[og.CaptureFit, ...]:
 
 
 def kill_one(client: Any, out: Path) -> None:
-    """As soon as four files are there and a fit is under way."""
+    """Kill a worker as soon as four files are written and a fit is under way."""
     pids = list(client.run(os.getpid).values())
     while len(list(out.glob("*.ogpc"))) < 4 or not list(out.glob("*.work")):
         time.sleep(0.005)

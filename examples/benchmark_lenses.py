@@ -1,17 +1,17 @@
-"""The demo's room photographed by other lenses: labels and seconds beside those of pinhole images, one row a lens.
+"""The demo's room photographed by other lenses: labels and seconds beside those of pinhole images, one row per lens.
 
     python examples/benchmark_lenses.py [--seeds N ...] [--noise LEVEL] [--every N] [--runs N]
 
-pinhole       60 images of 640x480, as the demo has them
+pinhole       60 images of 640x480, as in the demo
 fisheye       60 images of 640x480 from the same places, equidistant, 180 degrees across
-its faces     what this becomes, but rendered as pinhole images with masks of their own: what splitting costs
+its faces     what it is split into, but rendered as pinhole images with their own masks: the cost of splitting
 spherical     20 panoramas of 1280x640 from every third place (--every)
 its faces     as above
 
-Masks and features are simulated as for the demo, on each image as it is, but that the smallest mask has as many pixels
-in all of them as in the demo's: as a share of the image it would have 2.7 times as many on a panorama, a third on its
-faces. Points and truth are the same in all rows. Seconds are the processor's; the ratio is to those of pinhole images.
-The first fit compiles: for ratios take two runs or more (--runs), of which the least seconds count.
+Masks and features are simulated as for the demo, on each image as it is, except that the smallest mask has as many
+pixels in all of them as in the demo's: as a share of the image it would have 2.7 times as many on a panorama, a third
+on its faces. Points and truth are the same in all rows. Seconds are processor seconds; the ratio is to those of pinhole
+images. The first fit compiles: for ratios take two runs or more (--runs), where the least seconds count.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from og_pointcloud.scene import Camera
 
 FISHEYE, PANORAMA = (640, 480), (1280, 640)
 LENS_STREAM = 50
-"""Of random numbers, beside the demo's."""
+"""Random number stream, besides the demo's."""
 
 
 @dataclass(frozen=True)
 class Photographer:
-    """What a `RayCaster` asks of a camera, where it stands, and what transforms.json says of it.
+    """What a `RayCaster` needs of a camera, its pose, and its entries in transforms.json.
 
     rays: (H, W, 3). pose: camera to world, OpenCV axes.
     """
@@ -125,7 +125,7 @@ def photographed(
 
 
 def faces_of(cameras: Sequence[Photographer], lens: Lens) -> list[Photographer]:
-    """Pinhole cameras of the views that these photographs become."""
+    """Pinhole cameras of the views that these photographs are split into."""
     views = []
     for camera in cameras:
         k = camera.keys
@@ -136,7 +136,7 @@ def faces_of(cameras: Sequence[Photographer], lens: Lens) -> list[Photographer]:
 
 
 def lenses(capture: RoomCapture, every: int) -> dict[str, list[Photographer]]:
-    """The cameras of each row; every: from how many places there is one panorama."""
+    """The cameras of each row. every: number of places per panorama."""
     places = [frame.camera_to_world for frame in capture.frames]
     equidistant = lens_of("fisheye", {})
     assert equidistant is not None
@@ -151,7 +151,7 @@ def lenses(capture: RoomCapture, every: int) -> dict[str, list[Photographer]]:
 
 
 def written(capture: RoomCapture, cameras: Sequence[Photographer], folder: Path) -> Path:
-    """The folder, with the capture in it."""
+    """The folder, with the capture written to it."""
     write_capture(capture, folder)
     content = json.loads((folder / "transforms.json").read_text())
     for frame, camera in zip(content["frames"], cameras, strict=True):
@@ -162,7 +162,7 @@ def written(capture: RoomCapture, cameras: Sequence[Photographer], folder: Path)
 
 @dataclass(frozen=True)
 class Row:
-    """What one fit took and gave. read, fit: the processor's seconds of reading and of the fit."""
+    """Cost and result of one fit. read, fit: processor seconds of reading and of the fit."""
 
     views: int
     miou: float
@@ -184,7 +184,7 @@ def row(capture: RoomCapture, folder: Path) -> Row:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--noise", type=float, default=1.0)

@@ -1,19 +1,19 @@
 """Maps that grow and places that change: error beside time, in the same row.
 
-    python examples/benchmark_maps.py frames CAPTURE          # each tenth: ms a frame, mIoU beside a fit of the same
+    python examples/benchmark_maps.py frames CAPTURE          # each tenth: ms per frame, mIoU beside a fit of the same
     python examples/benchmark_maps.py frames CAPTURE --shuffle --pose-noise 0.01 0.2 --depth-share 0.05
     python examples/benchmark_maps.py frames CAPTURE --every 4 --tenths 1     # a quarter of the frames, the end alone
-    python examples/benchmark_maps.py speed CAPTURE               # ms a frame at 100,000 and 1,000,000 points
+    python examples/benchmark_maps.py speed CAPTURE               # ms per frame at 100,000 and 1,000,000 points
     python examples/benchmark_maps.py loops CAPTURE --depth-noise 0.002   # memory over loops of the same path
     python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
-    python examples/benchmark_maps.py pairs FOLDER... --sparse 5000   # the same as structure from motion has them
+    python examples/benchmark_maps.py pairs FOLDER... --sparse 5000   # the same, sparse as from structure from motion
     python examples/benchmark_maps.py days SEED...                # demo rooms: a map that goes on growing the next day
 
-A capture has gt.npz for its scores; its depth images, if it has any, make the map, else its own cloud is given. Beside
-the map stand fits of the same frames: of the capture's own points, and of those that `og-pointcloud fuse` makes of the
-depth images which made the map. All three are scored at the capture's own points, each labelled as the nearest one is.
-Times are of `integrate` alone, without the models'; CPU milliseconds stand beside them, as other programs slow the wall
-clock down. A pair is scored by SuperMap's definitions: IoU above 0.1, centroid within 0.3 m.
+A capture has gt.npz for its scores; the map is made from its depth images, if it has any, else its own cloud is given.
+The map is compared with fits of the same frames: with the capture's own points, and with those that `og-pointcloud
+fuse` makes from the map's depth images. All three are scored at the capture's own points, each labelled like its
+nearest one. Times are of `integrate` alone, without the models'; CPU milliseconds are given too, as other programs slow
+the wall clock. A pair is scored by SuperMap's definitions: IoU above 0.1, centroid within 0.3 m.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from og_pointcloud.scene import Camera, Points, Scene
 TENTHS, WARM_UP, LOOPS = 10, 5, 4
 SIZES = 100_000, 1_000_000
 TEXTURED, FALLS_OFF_M = 60, 0.35
-"""Places of a room that structure from motion finds, and the distance from them at which it finds a third as much."""
+"""Textured places of a room, where structure from motion finds points, and the distance at which it finds a third."""
 OFF_M, STRAY, STRAY_M = 0.008, 0.01, 0.3
-"""Its points' noise; the share of its strays, and how far off these are."""
+"""Noise of its points; share of strays, and how far off these are."""
 SPARSE_POSES = 0.005, 0.1
-"""Its poses' noise: meters, degrees."""
+"""Noise of its poses: meters, degrees."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def frames_of(folder: Path, options: argparse.Namespace) -> tuple[Scene, list[og.Frame]]:
-    """A capture and its views as frames, thinned and disturbed as asked."""
+    """A capture and its views as frames, thinned and disturbed by the options."""
     capture, random = read_capture(folder), np.random.default_rng(0)
     capture = replace(capture, views=capture.views[:: options.every])
     depths = depth_files(folder, read_poses(folder))
@@ -100,14 +100,14 @@ def _moved(camera: Camera, random: np.random.Generator, meters: float, degrees: 
 
 
 def mapper_of(capture: Scene, frames: list[og.Frame]) -> og.Mapper:
-    """A mapper of the capture's own cloud, or an empty one where frames have depth."""
+    """A mapper with the capture's own cloud, or an empty one if frames have depth."""
     if all(frame.depth is not None for frame in frames):
         return og.Mapper(feature_space=capture.feature_space)
     return og.Mapper(cloud=capture.points, feature_space=capture.feature_space)
 
 
 def miou(cloud: og.LabelledCloud, folder: Path, xyz: np.ndarray) -> float:
-    """Of the capture's own points, each labelled as the cloud's nearest one."""
+    """mIoU at the capture's own points, each labelled like the cloud's nearest one."""
     result = og.segment(cloud, text_features=folder / "text_features.npz")
     labels = result.labels
     if len(cloud) != len(xyz):
@@ -129,7 +129,7 @@ def with_fused_points(capture: Scene, folder: Path) -> Scene:
 
 
 def growing(folder: Path, options: argparse.Namespace) -> None:
-    """A table of each tenth of the frames."""
+    """Print a row for each tenth of the frames."""
     capture, frames = frames_of(folder, options)
     mapper, xyz = mapper_of(capture, frames), capture.points.xyz_world
     print(f"\n{folder.name}: {len(frames)} frames, {len(capture.points):,} points in the capture")
@@ -163,7 +163,7 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
 
 
 def speed(folder: Path, options: argparse.Namespace) -> None:
-    """Milliseconds a frame in maps of SIZES points: on the way from the capture's to their neighbors."""
+    """Milliseconds per frame in maps of SIZES points, which lie between the capture's points and their neighbors."""
     capture, frames = frames_of(folder, options)
     xyz, random = capture.points.xyz_world, np.random.default_rng(0)
     near = np.asarray(cKDTree(xyz).query(xyz, k=5, workers=-1)[1])
@@ -185,7 +185,7 @@ def speed(folder: Path, options: argparse.Namespace) -> None:
 
 
 def loops(folder: Path, options: argparse.Namespace) -> None:
-    """Memory after each of LOOPS loops of the same path, each with noise of its own in the depth."""
+    """Memory after each of LOOPS loops of the same path, each with its own depth noise."""
     capture, frames = frames_of(folder, options)
     mapper, random = mapper_of(capture, frames), np.random.default_rng(0)
     for loop in range(LOOPS):
@@ -198,7 +198,7 @@ def loops(folder: Path, options: argparse.Namespace) -> None:
 
 
 def as_sparse(capture: Scene, folder: Path, count: int) -> Scene:
-    """A capture as structure from motion has it: few uneven points of what three views see, noise, strays."""
+    """A capture as from structure from motion: few uneven points that three views see, with noise and strays."""
     random, xyz = np.random.default_rng(ord(folder.name[0])), capture.points.xyz
     textured = xyz[random.integers(0, len(xyz), TEXTURED)]
     likely = np.exp(-cKDTree(textured).query(xyz)[0] / FALLS_OFF_M) * (np.load(folder / "gt.npz")["views"] > 2)
@@ -211,7 +211,7 @@ def as_sparse(capture: Scene, folder: Path, count: int) -> Scene:
 
 
 def pairs(folders: list[Path], sparse: int = 0) -> None:
-    """Each pair's changes and errors, and the figures over all. sparse: points of each visit, 0 for all of them."""
+    """Print each pair's changes and errors, and the figures over all. sparse: points of each visit, 0 for all."""
     total = PairScore()
     print("pair      changes found  moved followed  reported right      s")
     for folder in folders:
@@ -237,7 +237,7 @@ def pairs(folders: list[Path], sparse: int = 0) -> None:
 
 
 def days(seeds: list[Path]) -> None:
-    """The demo room on two days, by one mapper: whether it knows what moved, left and came, and what it says beside."""
+    """The demo room on two days, by one mapper: whether it finds what moved, left and came, and false reports."""
     from og_pointcloud_room.second_visit import TwoDays
 
     total, wrong = np.zeros(3, int), 0

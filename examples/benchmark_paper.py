@@ -3,11 +3,11 @@
     python examples/benchmark_paper.py kitchen shelf                        # all tables: losses, codebook, association
     python examples/benchmark_paper.py kitchen --table repairs --seeds 3 --share 0.06 --pixels 19200 -o out/paper
 
-A capture needs gt.npz and text_features.npz. Rows that differ only in the association share a training, and
-their seconds, which are the processor's, have all of it. What is measured stays in OUT/rows.csv: the same command goes
-on where it was interrupted. Each cell is the mean mIoU over the seeds with the lowest and the highest; the last columns
-are the difference to the method as published, over all captures and seeds, with its 95 % bootstrap interval, and the
-mIoU that the paper gives the row, on ScanNet. Writes OUT/TABLE.md.
+A capture needs gt.npz and text_features.npz. Rows that differ only in the association share a training, and their
+processor seconds include all of it. Results are kept in OUT/rows.csv: the same command continues where it was
+interrupted. Each cell is the mean mIoU over the seeds, with the lowest and the highest; the last columns are the
+difference to the method as published, over all captures and seeds, with its 95 % bootstrap interval, and the row's mIoU
+in the paper, on ScanNet. Writes OUT/TABLE.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from og_pointcloud.settings import FitSettings, MatchingSettings, PaperSettings
 
 BOTH = "as published"
 SHAPES = "trained_shapes"
-"""Not a setting: the first stage is that of trained_shapes.py."""
+"""Not a setting: selects the first stage of trained_shapes.py."""
 
 
 def one_level(k: int, positions: bool) -> Mapping[str, Any]:
@@ -70,7 +70,7 @@ ABLATIONS: Mapping[str, Mapping[str, tuple[float, Mapping[str, Any]]]] = {
     },
 }
 """Rows of the paper's tables (Sec. 4.4): their mIoU there, on 10 classes of ScanNet (other data: compare the order, not
-the size), and what the row changes of mode paper."""
+the size), and what the row changes in mode paper."""
 PIECES = {"paper.matching.score": "within"}
 BY_SCENE = {"paper.matching.relative": True, "paper.matching.threshold": 0.5}
 REPAIRS: Mapping[str, Mapping[str, Any]] = {
@@ -92,7 +92,7 @@ REPAIRS: Mapping[str, Mapping[str, Any]] = {
     },
     "mode fast": {"mode": "fast"},
 }
-"""Row -> what it changes of mode paper."""
+"""Row -> what it changes in mode paper."""
 
 
 def tables() -> dict[str, dict[str, tuple[float | None, Mapping[str, Any]]]]:
@@ -106,7 +106,7 @@ def tables() -> dict[str, dict[str, tuple[float | None, Mapping[str, Any]]]]:
 
 @dataclass(frozen=True)
 class Measured:
-    """A row of OUT/rows.csv. settings: what was changed. seconds: of the processor, of a whole fit."""
+    """A row of OUT/rows.csv. settings: what was changed. seconds: processor seconds of a whole fit."""
 
     capture: str
     settings: str
@@ -118,7 +118,7 @@ class Measured:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure what is not there yet, print and write the tables."""
+    """Measure what is missing, print and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE")
     parser.add_argument("--table", choices=[*tables()], action="append", help="default: the three of the paper")
@@ -164,7 +164,7 @@ def measure(capture: Path, base: FitSettings, rows: Sequence[Mapping[str, Any]],
 
 
 class Trial:
-    """One capture; what was trained is kept for the rows that only associate differently."""
+    """One capture; trained features are kept for rows that differ only in the association."""
 
     def __init__(self, subject: Subject, base: FitSettings) -> None:
         self.subject, self.base = subject, base
@@ -198,7 +198,7 @@ class Trial:
     def training(
         self, prepared: Prepared, settings: FitSettings, shapes: bool
     ) -> tuple[Surface, NDArray[np.float32], Any, float]:
-        """The surface, features, codebook, and the seconds that they took. shapes: of the Gaussians trained too."""
+        """The surface, features, codebook, and the seconds they took. shapes: train the Gaussians' shapes too."""
         key = changed(settings, "paper.matching", MatchingSettings()), shapes
         surface, table = prepared.surface, prepared.table
         if self.source is None:
@@ -231,7 +231,7 @@ def key_of(changes: Mapping[str, Any]) -> str:
 
 
 def read_rows(file: Path) -> Iterator[Measured]:
-    """The rows of the file, none where there is none."""
+    """The rows of the file; none if there is no file."""
     if file.is_file():
         with file.open(newline="") as lines:
             for row in csv.DictReader(lines):

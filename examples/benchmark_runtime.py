@@ -1,11 +1,11 @@
-"""How fast a scene labels a frame, at what error, beside scipy's KD-tree; and what the runtime weighs.
+"""How fast a scene labels a frame, and at what error, compared with scipy's KD-tree; and the footprint of the runtime.
 
-    python examples/benchmark_runtime.py SCENE.ogpc                # seconds a frame of 10,000 to a million points
+    python examples/benchmark_runtime.py SCENE.ogpc                # seconds per frame of 10,000 to a million points
     python examples/benchmark_runtime.py SCENE.ogpc --footprint    # import, first answer, memory, installed size
 
-A frame is points of the scene's own cloud moved by noise; labels are given, as in a stream. Each round times every way
-once, so that ratios hold on a busy machine too. differ: share of points whose instance is not the one that the KD-tree
-(exact, all cores) finds. --footprint needs the base install alone.
+A frame is points of the scene's own cloud moved by noise; labels are given, as in a stream. Each round times every
+method once, so that ratios hold on a busy machine too. differ: share of points whose instance is not the one that the
+KD-tree (exact, all cores) finds. --footprint needs only the base install.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def exact_lookup(cloud: og.LabelledCloud) -> Callable[[NDArray[np.float64]], NDA
 
 
 def print_lookups(scene: og.LabelledScene, sizes: Sequence[int], noise: float, rounds: int) -> None:
-    """A row a frame: medians of the rounds."""
+    """Print a row per frame size: medians over the rounds."""
     cloud = scene.cloud
     words = {f"thing {row}": vector for row, vector in enumerate(cloud.instances.descriptors[:8])} or {"a": [1.0]}
     segmenter, exact = og.Segmenter(scene, words), exact_lookup(cloud)
@@ -119,7 +119,7 @@ def print_footprint(scene: Path) -> None:
 
 
 def installed_sizes(root: str) -> dict[str, int]:
-    """Bytes on disk of a distribution and of all that it needs without an extra."""
+    """Bytes on disk of a distribution and of everything it requires without extras."""
     sizes: dict[str, int] = {}
     waiting = [root]
     while waiting:

@@ -1,12 +1,12 @@
-"""How long a typed word takes to light its points on the live page of `og-pointcloud serve`.
+"""How long a typed word takes to highlight its points on the live page of `og-pointcloud serve`.
 
     python examples/benchmark_serve.py SCENE.ogpc                   # at 300,000 points
     python examples/benchmark_serve.py SCENE.ogpc --points 1000000
 
 The cloud shown is points of the scene's own, moved by noise. answer: the word is looked up, instances are chosen and
-points colored, in Python: on the clock, and of one core. told: from the key to the answer in the panel, which comes
-with the picture where the browser draws slowly. lit: to the first frame of the browser's screencast that looks another
-way. Both need playwright and a Chromium.
+points colored, in Python: wall clock, and processor time of one core. told: from the key press to the answer in the
+panel, which comes with the picture where the browser draws slowly. lit: to the first frame of the browser's screencast
+that looks different. Both need playwright and a Chromium.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ WATCH = """
     }).observe(document.body, changed)
   }, { once: true })
 }"""
-"""Notes when a key came and when its answer was there, in milliseconds since 1970."""
+"""Records when a key was pressed and when its answer appeared, in milliseconds since 1970."""
 LOOKED_AT = 0.5
-"""Of the window's width, from the left: the points, without the panel."""
+"""Share of the window's width, from the left, that shows the points, without the panel."""
 ANOTHER = 4.0
-"""Mean difference of the values of pixels, 0 to 255, of a frame that looks another way: more than JPEG's error."""
+"""Mean difference of pixel values, 0 to 255, from which a frame looks different: more than JPEG's error."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     words = (words * options.rounds)[: options.rounds]
     print(f"{options.points:,} points, {len(scene.cloud.instances)} instances, {len(live.names)} words")
-    live.ask(words[0])  # what is made once
+    live.ask(words[0])  # one-time work
     live.colors()
     both = [answer_seconds(live, word) for word in words]
     print_row("answer", [clock for clock, _ in both])
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def print_row(name: str, seconds: Sequence[float]) -> None:
-    """Median and largest."""
+    """Print median and maximum."""
     print(
         f"{name:<18} median {1e3 * float(np.median(seconds)):7.1f} ms   largest {1e3 * max(seconds):7.1f} ms",
         flush=True,
@@ -102,7 +102,7 @@ def print_row(name: str, seconds: Sequence[float]) -> None:
 
 
 def answer_seconds(live: LiveScene, word: str) -> tuple[float, float]:
-    """From a word to the colors of all points: on the clock, and computing."""
+    """From a word to the colors of all points: wall clock, and processor time."""
     start, computing = time.perf_counter(), time.process_time()
     live.ask(word)
     live.colors()
@@ -128,7 +128,7 @@ def opened(chromium: Any, executable: str, live: LiveScene) -> Iterator[Any]:
 
 
 def browser_seconds(page: Any, word: str) -> tuple[float, float]:
-    """From the key to the answer, and to the first frame that looks another way. Everything is lit before."""
+    """From the key press to the answer, and to the first frame that looks different. Everything is lit before."""
     page.locator("form input").fill("")
     page.wait_for_timeout(3000)
     frames = frames_of(page, word)
@@ -141,8 +141,8 @@ def browser_seconds(page: Any, word: str) -> tuple[float, float]:
 
 
 def frames_of(page: Any, word: str) -> list[tuple[float, NDArray[np.int16]]]:
-    """Type a word: each frame of the browser from a second before, when it was shown in seconds since 1970, and its
-    pixels beside the panel."""
+    """Type a word: each frame of the browser from a second before on: when it was shown, in seconds since 1970, and
+    its pixels beside the panel."""
     frames: list[tuple[float, str]] = []
     cast = page.context.new_cdp_session(page)
 

@@ -1,14 +1,14 @@
-"""3DGS files that are really trained, on photographs of made rooms: labels of Gaussians, and of held-out photographs.
+"""3DGS files actually trained, on photographs of made rooms: labels of Gaussians, and of held-out photographs.
 
     python examples/benchmark_splats.py -o out/splats                       # all rooms; a minute or two each, to train
     python examples/benchmark_splats.py -o out/splats --half judge
 
 A room is fitted twice, from the same masks: as a 3DGS of what its photographs show, and as a cloud of its surfaces. A
-Gaussian's truth is that of the nearest point of a dense exact cloud, if one is as near as it is large. But Gaussians
-may lie anywhere and reach over edges as long as photographs come out right. So labels are drawn as well, in photographs
-that neither the training nor the fit has seen: a pixel is of the class that most of its light comes from. Beside that
-stand the best of the baselines, what the truth of the nearest point scores there, given to each Gaussian as its label,
-and about the most that labels can: of the class of the pixels that most of a Gaussian's light goes to. Writes
+Gaussian's truth is that of the nearest point of a dense exact cloud, if that is within the Gaussian's size. But
+Gaussians may lie anywhere and reach over edges as long as photographs come out right. So labels are also drawn in
+photographs that neither the training nor the fit has seen: a pixel gets the class that most of its light comes from.
+That is compared with the best of the baselines; with giving each Gaussian the truth of its nearest point; and with
+about the best that labels can reach: the class of the pixels that receive most of a Gaussian's light. Writes
 OUT/splats.csv, and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn labels.
 """
 
@@ -47,20 +47,20 @@ from og_pointcloud.text.text_features import read_text_features
 
 ROOMS = tuple(f"{place}-{number}" for place in ("room", "shelf", "table", "desk") for number in (0, 1))
 WIDTH, VIEWS, HELD_OUT = 256, 42, 6
-"""Of the photographs; each HELD_OUT-th is neither trained on nor fitted."""
+"""Width and number of the photographs; each HELD_OUT-th is neither trained on nor fitted."""
 START, MOST = 5_000, 20_000
-"""Points that a training begins with, and Gaussians at most."""
+"""Initial points of a training, and maximum number of Gaussians."""
 DENSE = 300_000
-"""Points of the cloud from which Gaussians have their truth."""
+"""Points of the cloud that Gaussians take their truth from."""
 COVERED = 0.5
-"""A pixel is drawn where so much of its light is of Gaussians."""
+"""A pixel is drawn where at least this share of its light comes from Gaussians."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """color_error: mean absolute difference of held-out photographs and the 3DGS, in [0, 1]. miou, background: of the
-    Gaussians. drawn, drawn_background: of held-out photographs' pixels; baseline: the best one there, nearest: the
-    nearest points' truth there, possible: labels from these photographs' own truth. cloud: mIoU of the room as a cloud.
+    """color_error: mean absolute difference between held-out photographs and the 3DGS, in [0, 1]. miou, background: of
+    the Gaussians. drawn, drawn_background: of held-out photographs' pixels; there, baseline: the best one; nearest: the
+    nearest points' truth; possible: labels from these photographs' own truth. cloud: mIoU of the room as a cloud.
     seconds: of the 3DGS's fit, capture in memory."""
 
     scene: str
@@ -78,7 +78,7 @@ class Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train what is not there yet, fit, print, write."""
+    """Train what is missing, fit, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/splats"), help="folder of scenes and results")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="rooms whose name begins so")
@@ -109,7 +109,7 @@ def measured(name: str, output: Path) -> Row:
         write_capture(fitted, cloud)
         write_capture(fitted, unfinished := splat.with_suffix(".part"))
         write_ply(unfinished / "points.ply", {"vertex": gaussian_rows(_trained_on(fitted))})
-        (unfinished / GT_NAME).unlink()  # of the cloud
+        (unfinished / GT_NAME).unlink()  # it is the cloud's
         unfinished.rename(splat)
     scene, quiet = read_capture(splat), Journal(progress=False)
     warm_up(scene)
@@ -169,7 +169,7 @@ def _truth(points: Points, exact: RoomCapture) -> tuple[Truth, NDArray[np.int32]
 
 
 def _class_of(capture: RoomCapture) -> NDArray[np.int32]:
-    """(objects + 1,) the class of each owner of a pixel; the last is of background."""
+    """(objects + 1,) the class of each owner of a pixel; the last is for background."""
     return np.array([*(capture.names.index(item.name) for item in capture.room.objects), -1], np.int32)
 
 
@@ -178,7 +178,7 @@ def _in_world(points: Points) -> Gaussians:
 
 
 def _possible(capture: RoomCapture, points: Points) -> NDArray[np.int64]:
-    """(n,) the class of the pixels, in photographs held out, that most of a Gaussian's light goes to, -1 background."""
+    """(n,) the class of the pixels in held-out photographs that receive most of a Gaussian's light, -1 background."""
     gaussians, class_of, held_out = _in_world(points), _class_of(capture), _held_out(len(capture.frames))
     light = np.zeros((len(capture.names) + 1, len(points)))
     for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
@@ -191,7 +191,7 @@ def _possible(capture: RoomCapture, points: Points) -> NDArray[np.int64]:
 def _drawn(
     capture: RoomCapture, points: Points, labels: NDArray[np.integer], picture: Path | None = None
 ) -> tuple[Score, float]:
-    """The score of labels drawn in the photographs held out, and how far colors are off there."""
+    """The score of labels drawn in the held-out photographs, and the color error there."""
     gaussians, class_of = _in_world(points), _class_of(capture)
     classes, held_out = len(capture.names) + 1, _held_out(len(capture.frames))
     assert points.rgb is not None

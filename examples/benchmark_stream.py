@@ -1,11 +1,11 @@
-"""Frames of any size through one Segmenter, for as long as asked: does memory stay where it was?
+"""Frames of any size through one Segmenter, for any length of time: does memory stay constant?
 
     python examples/benchmark_stream.py --frames 1000000 --points 300      # a million small frames
     python examples/benchmark_stream.py --seconds 600                      # a soak of ten minutes
 
-A room of 500 points is asked with frames of 0 to --points points, now and then far away, or with NaN and infinity among
-them, and every hundredth frame with another list of labels, as `~/set_labels` of the ROS node gives them. Printed are
-the resident bytes of the process after so many frames; the last line is how far they rose after the first 10,000.
+A room of 500 points labels frames of 0 to --points points, now and then far away, or with NaN and infinity among them,
+and with another list of labels every hundredth frame, as `~/set_labels` of the ROS node does. It prints the resident
+bytes of the process after increasing numbers of frames; the last line is how far they rose after the first 10,000.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ import og_pointcloud as og
 from og_pointcloud.cloud import unit_rows
 
 SETTLED = 10_000
-"""Frames after which buffers have their size."""
+"""Frames after which buffers have their final size."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=50_000, help="at most")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="at most")
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def stream(scene: og.LabelledScene, frames: int, points: int) -> Iterator[float]:
-    """Ask so many frames of up to so many points; after each the resident megabytes of the process."""
+    """Label ``frames`` frames of up to ``points`` points; yields the resident megabytes of the process after each."""
     random, xyz = np.random.default_rng(0), np.resize(scene.xyz, (points, 3))
     words = scene.vocabulary
     assert words is not None
@@ -80,8 +80,8 @@ def made_room() -> og.LabelledCloud:
 
 
 def resident_mb() -> float:
-    """Of this process; Linux alone tells."""
-    with open("/proc/self/statm") as file:  # a Path would fill Python's table of interned strings, 5 MB in a million
+    """Resident megabytes of this process; Linux only."""
+    with open("/proc/self/statm") as file:  # a Path would fill Python's table of interned strings, 5 MB per million
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 

@@ -1,10 +1,10 @@
-"""A very large cloud, fitted in tiles on a Dask cluster of this machine: seconds by stage and memory by worker, beside
-the same fit without a cluster.
+"""A very large cloud, fitted in tiles on a local Dask cluster: seconds by stage and memory by worker, compared with the
+same fit without a cluster.
 
     PYTHONPATH=tests python examples/benchmark_street.py --points 20000000 --views 200 --tile-points 1000000
 
-The street is made (tests/street.py), so its truth is known: the last line scores what was found. `--check` makes the
-fit once more without the cluster and compares all that it says, bit for bit.
+The street is generated (tests/street.py), so its truth is known: the last line scores the result. `--check` repeats the
+fit without the cluster and compares all results bit for bit.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def report(name: str, cloud: LabelledCloud, seconds: float) -> None:
 
 
 def purity(cloud: LabelledCloud, owner: np.ndarray) -> float:
-    """Share of the points in instances that are of the object that most of their instance is of."""
+    """Share of the points in instances that belong to their instance's most frequent object."""
     labelled = cloud.instance_ids >= 0
     table = np.zeros((len(cloud.instances), int(owner.max()) + 2), np.int64)
     np.add.at(table, (cloud.instance_ids[labelled], owner[labelled]), 1)  # ground, -1, is the last column
@@ -75,13 +75,13 @@ def purity(cloud: LabelledCloud, owner: np.ndarray) -> float:
 
 
 def same(first: LabelledCloud, second: LabelledCloud) -> bool:
-    """Whether two clouds say the same of every point and instance."""
+    """Whether two clouds agree on every point and instance."""
     pairs = [(first.instance_ids, second.instance_ids), (first.certainty, second.certainty)]
     pairs += [
         (getattr(first.instances, column.name), getattr(second.instances, column.name))
         for column in fields(first.instances)
     ]
-    # What is not known is NaN in both: tiles say nothing of reliability.
+    # What is not known is NaN in both: tiles have no reliability.
     return all(np.array_equal(np.asarray(one, float), np.asarray(other, float), equal_nan=True) for one, other in pairs)
 
 

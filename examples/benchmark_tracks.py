@@ -1,10 +1,10 @@
-"""What tracks of masks bring: zoo scenes fitted without, with the true ids of things, and as trackers lose them.
+"""What mask tracks gain: zoo scenes fitted without tracks, with the true ids of things, and with imperfect trackers'.
 
     python examples/benchmark_tracks.py -o out/zoo [--half judge] [--only NAME ...]
 
-A track ends where its thing is out of sight for an image, and begins anew with another number ("lost": trackers do this
-at every turn of the camera); of "wrong" so many masks have the track of another thing of their image as well. One row a
-scene: mIoU by points, without tracks, and with each kind.
+"lost": a track ends where its thing is out of sight for an image, and starts again with another number, as trackers do
+at every turn of the camera. "wrong": in addition, some masks have the track of another thing in their image. One row
+per scene: mIoU by points, without tracks, and with each kind.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.scene import Scene
 
 Tracks = list[NDArray[np.int64]]
-"""Of each view, one a mask, -1 none."""
+"""For each view, one track per mask, -1 none."""
 WRONG = 0.1
 
 
 def true_tracks(name: str) -> Tracks:
-    """The thing that each mask shows most of."""
+    """The thing that fills most of each mask."""
     capture = drawn_capture(draw(name))
     counts = [len(rows) for rows in capture.mask_features]
     return np.split(capture.mask_instance.astype(np.int64), np.cumsum(counts)[:-1])
@@ -52,7 +52,7 @@ def lost(tracks: Tracks) -> Tracks:
 
 
 def wrong(tracks: Tracks) -> Tracks:
-    """As `lost`, with some masks that have the track of another of their image."""
+    """As `lost`, but some masks have the track of another mask in their image."""
     rng = np.random.default_rng(0)
     return [np.where(rng.uniform(size=len(view)) < WRONG, rng.permutation(view), view) for view in lost(tracks)]
 
@@ -71,7 +71,7 @@ def with_tracks(scene: Scene, tracks: Tracks | None) -> Scene:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """The table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/zoo"))
     parser.add_argument("--half", choices=tuple(HALVES))

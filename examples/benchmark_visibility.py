@@ -1,11 +1,11 @@
-"""The visibility kernel: seconds a view of one core, and error against float64, in the same row.
+"""The visibility kernel: seconds per view on one core, and error against float64, in the same row.
 
     python examples/benchmark_visibility.py              # made rooms of 10,000 to a million Gaussians
     python examples/benchmark_visibility.py CAPTURE      # also the middle view of a capture, as `fit` draws it
 
-Errors are those of a window in which a literal float64 reference (tests/reference_splatting.py) can be afforded, as
-parts of the largest and of the mean weight. Below, what leaving more out than 3DGS does would win and lose. `make
-bench` compares two revisions.
+Errors are measured in a window small enough for a literal float64 reference (tests/reference_splatting.py), relative to
+the largest and to the mean weight. Below: what stronger cutoffs than 3DGS's would gain and lose. `make bench` compares
+two revisions.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-if __name__ == "__main__":  # else a test that imports it would be of one core too
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # a fit works on as many views at once as there are cores
+if __name__ == "__main__":  # otherwise tests that import it would run on one core too
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # a fit works on one view per core
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ class Case:
     thickness: NDArray[np.float32] | None = None
 
     def draw(self, cutoffs: Cutoffs = CUTOFFS["3DGS: alpha 1/255, light 1e-4"]) -> ViewWeights:
-        """The kernel's answer."""
+        """The kernel's result."""
         return view_weights(
             self.gaussians, self.camera, self.ids, self.mask_count, self.near, self.thickness, cutoffs=cutoffs
         )
@@ -95,7 +95,7 @@ def capture_case(folder: Path) -> Case:
 
 
 def window_of(case: Case) -> Case:
-    """The middle of a view, without the Gaussians that are far from it in the image."""
+    """The middle of a view, without Gaussians far from it in the image."""
     width, height = (min(size, whole) for size, whole in zip(WINDOW, case.ids.shape[::-1], strict=True))
     left, top = (case.camera.width - width) // 2, (case.camera.height - height) // 2
     camera = case.camera
@@ -111,21 +111,21 @@ def window_of(case: Case) -> Case:
 
 
 def reference_of(window: Case) -> NDArray[np.float64]:
-    """(mask_count + 1, n) float64, by the literal form."""
+    """(mask_count + 1, n) float64, by the literal reference."""
     from reference_splatting import reference_view_weights  # pyright: ignore[reportMissingImports]  (in tests/)
 
     return reference_view_weights(window.gaussians, window.camera, window.ids, window.mask_count, window.near)
 
 
 def errors(window: Case) -> tuple[float, float]:
-    """Largest and mean error of a window's weights, as parts of the largest and the mean weight."""
+    """Largest and mean error of a window's weights, relative to the largest and the mean weight."""
     reference = reference_of(window)
     error = np.abs(window.draw().rows.toarray() - reference)
     return float(error.max() / reference.max()), float(error.sum() / reference.sum())
 
 
 def fastest(work: Callable[[], ViewWeights]) -> tuple[float, ViewWeights]:
-    """Seconds of the processor, the least of several runs after a discarded one; and the result."""
+    """Processor seconds, the least of several runs after a discarded one; and the result."""
     result, taken = work(), []
     for _ in range(RUNS):
         start = time.process_time()
@@ -135,7 +135,7 @@ def fastest(work: Callable[[], ViewWeights]) -> tuple[float, ViewWeights]:
 
 
 def print_kernel(cases: Sequence[Case]) -> None:
-    """A row a case."""
+    """Print a row per case."""
     print(f"{'scene':<26} {'image':<10} {'s a view':>8} {'Gaussians/s':>12}  largest error  mean error")
     for case in cases:
         seconds, _ = fastest(case.draw)
@@ -146,7 +146,7 @@ def print_kernel(cases: Sequence[Case]) -> None:
 
 
 def print_cutoffs(cases: Sequence[Case]) -> None:
-    """Weight that is lost and time that is won by leaving more out than 3DGS does; errors of whole images."""
+    """Print the weight lost and the time gained by stronger cutoffs than 3DGS's; errors of whole images."""
     print(f"\n{'cut-offs':<30} {'scene':<26} {'s a view':>8} {'weight lost':>12} {'largest error, pixels':>22}")
     for case in cases:
         exact = case.draw().rows

@@ -16,11 +16,11 @@ from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import AGREES, THROUGH, states_of_points
 
 FEWEST_POINTS = 20
-"""A thing of which a visit's views see fewer points is not scored: neither visit shows it."""
+"""A thing is not scored if a visit's views see fewer of its points than this: that visit does not show it."""
 LOOKED_AT = 0.3
-"""A thing that left counts where the later visit looks at this share of its place."""
+"""A thing that left counts if the later visit looks at this share of its place."""
 OVERLAP = 0.1
-"""IoU of points above which an instance is of a thing."""
+"""IoU of points above which an instance matches a thing."""
 NEAR_M = 0.3
 """Distance of centroids up to which a thing was found at its new place."""
 
@@ -54,7 +54,7 @@ class PairScore:
 
 def things_of(cloud: og.LabelledCloud, truth_xyz: NDArray[np.float64], thing: NDArray[np.integer]) -> list[set[int]]:
     """For each instance id of a cloud, the true things whose shown points overlap its own by an IoU above 0.1, and the
-    one of which it is a piece, mostly."""
+    one that it is mostly a piece of."""
     from scipy.spatial import cKDTree
 
     nearest = cKDTree(truth_xyz).query(cloud.xyz_world, workers=-1)[1]
@@ -73,7 +73,7 @@ def score_pair(
 ) -> PairScore:
     """A pair of rooms, ``a`` and ``b`` with changes.json, against a report's JSON.
 
-    before: what the ids of gone, moved and unseen are of. after: what those of new are of. visit: ``b`` alone.
+    before: the cloud that ids of gone, moved and unseen refer to. after: that of new ids. visit: ``b`` alone.
     """
     events = json.loads((folder / "b" / "changes.json").read_text())["changes"]
     truth = [np.load(folder / name / "gt.npz") for name in "ab"]
@@ -116,7 +116,7 @@ def score_pair(
 
 
 def _looked_at(visit: og.LabelledCloud, xyz: NDArray[np.float64], shown: NDArray[np.integer]) -> dict[int, float]:
-    """Of each thing of the earlier visit, the share of its shown points at which or through which the later looks."""
+    """For each thing of the earlier visit, the share of its shown points that the later visit looks at or through."""
     seen = np.zeros(len(xyz), bool)
     later = Visit(visit)
     local = (xyz - visit.origin).astype(np.float32)

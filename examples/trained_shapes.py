@@ -1,12 +1,12 @@
-"""Opacity and size of Gaussians trained with the mask losses, positions frozen: the paper's first limitation, tried.
+"""Opacity and size of Gaussians trained with the mask losses, positions frozen: the paper's first limitation, tested.
 
-A row of `benchmark_paper.py`, no part of the library: docs/paper.md says what it brings. A step draws a view anew, as
-its blending weights change, and the gradient runs back through the blending. Of a pixel ``M = sum_i T_i a_i f_i`` with
-``T_i = prod_{j<i} (1 - a_j)``, nearest first,
+A row of `benchmark_paper.py`, not part of the library: docs/paper.md has the results. A step draws a view anew, as its
+blending weights change, and the gradient is propagated back through the blending. For a pixel
+``M = sum_i T_i a_i f_i`` with ``T_i = prod_{j<i} (1 - a_j)``, nearest first,
 
     dM / da_i = T_i f_i - (sum_{j>i} T_j a_j f_j) / (1 - a_i)
 
-and of ``a = o exp(-q / 2)``, ``q = d' C^-1 d``, ``C = s^2 C0 + LOW_PASS I`` at an offset d from the splat's center
+and for ``a = o exp(-q / 2)``, ``q = d' C^-1 d``, ``C = s^2 C0 + LOW_PASS I`` at an offset d from the splat's center
 
     da / do = a / o        da / dlog s = a (q - LOW_PASS |C^-1 d|^2)
 """
@@ -29,13 +29,13 @@ from og_pointcloud.rendering.splatting import ALPHA_MAX, CUTOFFS, LOW_PASS, Gaus
 from og_pointcloud.settings import PaperSettings
 
 OPACITY_RATE, SIZE_RATE = 2e-3, 4e-4
-"""Adam's step lengths for logits of opacities and logarithms of sizes: the best of five pairs on room-0 and table-0."""
+"""Adam's learning rates for opacity logits and logarithms of sizes: the best of five pairs on room-0 and table-0."""
 
 
 def train_with_shapes(
     source: RenderedViews, settings: PaperSettings, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], RenderedViews]:
-    """Stage 1 of mode paper with shapes: raw features (n, width), these as read, and the views of the new Gaussians."""
+    """Stage 1 of mode paper with shapes: raw features (n, width), the same as read, and the new Gaussians' views."""
     base, near = source.gaussians, source.near
     opacity = torch.from_numpy(np.clip(base.opacity, 1e-3, 1 - 1e-3))
     shapes = {OPACITY_RATE: torch.logit(opacity).requires_grad_(), SIZE_RATE: torch.zeros(len(base)).requires_grad_()}
@@ -48,7 +48,7 @@ def train_with_shapes(
         view = source.views[int(rng.integers(len(source)))]
         try:
             drawn = RenderedViews(reshaped(base, logit, log_size), [view], near, settings, whole=False)
-        except SceneError:  # nothing of the view's masks is covered any more
+        except SceneError:  # no mask of the view is covered any more
             continue
         read = 0.5 + 0.5 * torch.nn.functional.normalize(raw, dim=1)
         image = _Drawn.apply(read, logit, log_size, drawn)
@@ -95,7 +95,8 @@ class _Drawn(torch.autograd.Function):
 def shape_gradient(
     source: RenderedViews, view: RenderedView, values: NDArray[np.floating], pull: NDArray[np.floating]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What a loss that pulls (pixels, c) at the image of values (known, c) says of opacities and log sizes: (n,) each.
+    """Gradients with respect to opacities and log sizes, (n,) each, of a loss with gradient ``pull`` (pixels, c) at
+    the image of values (known, c).
 
     view: of a source of this one view. Cut-offs of the blending have no gradient.
     """
@@ -120,10 +121,10 @@ def _add_gradient(sparse, pixels, width, values, pull, splats, opacity, found): 
     for row in range(len(pixels)):
         x, y = pixels[row] % width + 0.5, pixels[row] // width + 0.5
         entries = range(indptr[row], indptr[row + 1])
-        behind = 0.0  # pull on all that lies behind the entry
+        behind = 0.0  # gradient of everything behind the entry
         for e in entries:
             behind += weights[e] * (pull[row] * values[indices[e]]).sum()
-        light = 1.0  # T of the entry: what those before it let through
+        light = 1.0  # T of the entry: light that those before it let through
         for e in entries:
             g, weight = indices[e], np.float64(weights[e])
             own = (pull[row] * values[g]).sum()
@@ -131,7 +132,7 @@ def _add_gradient(sparse, pixels, width, values, pull, splats, opacity, found): 
             alpha = weight / light
             by_alpha = light * own - behind / (1.0 - alpha)
             light -= weight
-            if alpha > ALPHA_MAX * (1 - 1e-6):  # cut there: nothing moves it
+            if alpha > ALPHA_MAX * (1 - 1e-6):  # clipped there: no gradient
                 continue
             s = splats[g]
             # -log2 of the density is (across (dx + shear dy))^2 + down dy^2.

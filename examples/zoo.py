@@ -1,4 +1,4 @@
-"""The zoo: many small scenes of many kinds, half for choosing numbers, half only for judging them.
+"""The zoo: many small scenes of many kinds, half for choosing numbers, half only for judging.
 
     python examples/zoo.py -o out/zoo                                    # all made scenes
     python examples/zoo.py -o out/zoo --captures CAPTURE [CAPTURE ...]   # and captures with gt.npz, text_features.npz
@@ -7,10 +7,9 @@
     python examples/zoo.py -o out/zoo --only desk room --needs           # from less and less of each, as a table
     python examples/zoo.py -o out/zoo --constants docs/constants.md      # each number at half and at twice its value
 
-Scenes are made once, in OUT/scenes. Beside each fit stand the best of the baselines of
-`og_pointcloud.evaluate.baselines`, the difference with its 95 % interval over blocks of space, and how well the fit
-thinks that it did. Writes OUT/zoo.csv and OUT/zoo.png; --needs writes OUT/needs.csv and OUT/needs.png. Which half a
-scene is of, its name alone decides.
+Scenes are made once, in OUT/scenes. Each fit is listed with the best baseline of `og_pointcloud.evaluate.baselines`,
+the difference with its 95 % interval over blocks of space, and the fit's own reliability. Writes OUT/zoo.csv and
+OUT/zoo.png; --needs writes OUT/needs.csv and OUT/needs.png. A scene's name alone decides which half it is in.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from og_pointcloud.formats.capture import read_capture
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Make what is not there yet, measure, print, write."""
+    """Make missing scenes, measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/zoo"), help="folder of scenes and results")
     parser.add_argument("--captures", nargs="+", type=Path, default=[], metavar="CAPTURE", help="more scenes, by path")
@@ -81,7 +80,7 @@ def _needs(paths: Sequence[Path], options: argparse.Namespace) -> None:
     rows, file = [], options.output / "needs.csv"
     for change in ({}, *({kind: amount} for kind, amounts in LADDER.items() for amount in amounts)):
         rows += _rows(paths, options, change)
-        write_csv(rows, file)  # what is measured stays, should it be interrupted
+        write_csv(rows, file)  # results are kept in case of an interruption
     print(f"\n{needs_table(rows)}\n\n{file}\n{write_needs(rows, options.output / 'needs.png')}")
 
 

@@ -1,8 +1,8 @@
 """docs/gallery.md and its pictures: the numbered examples, run on the demo room.
 
-    python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene the demo is run first
+    python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene, the demo runs first
 
-Pictures are shrunk to WIDTH and written as JPEG, so that the repository stays small.
+Pictures are shrunk to WIDTH and written as JPEG, to keep the repository small.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ QUALITY = 82
 
 @dataclass(frozen=True)
 class Exhibit:
-    """An example, its arguments ({scene}, {capture}, {splats} and {out} are filled in), and the pictures of it that are
+    """An example, its arguments ({scene}, {capture}, {splats} and {out} are filled in), and which of its pictures are
     shown."""
 
     example: str
@@ -75,7 +75,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         scene = arguments.scene or demo(work / "demo")
-        # The edited room comes first: its splat file is what another example lights a word in.
+        # The edited room comes first: another example highlights a word in its splat file.
         order = sorted(EXHIBITS, key=lambda exhibit: exhibit.example != "08_edit_a_scene")
         for exhibit in order:
             print(exhibit.example, flush=True)
@@ -92,7 +92,7 @@ def demo(folder: Path) -> Path:
 
 
 def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
-    """Run an example in a folder of its own, and keep its pictures."""
+    """Run an example in its own folder, and keep its pictures."""
     out = work / exhibit.example
     out.mkdir(exist_ok=True)
     splats = work / "08_edit_a_scene" / "before.ply"
@@ -108,13 +108,13 @@ def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
 
 
 def page() -> str:
-    """The page's text: for each example its picture, what is seen in it, and a link to its code."""
+    """The page's text: for each example its picture, a caption, and a link to its code."""
     parts = ["# Gallery\n\nThe numbered examples on the demo room, made by `python scripts/make_gallery.py`.\n"]
     for exhibit in EXHIBITS:
         code = (ROOT / "examples" / f"{exhibit.example}.py").read_text()
         title = (ast.get_docstring(ast.parse(code)) or "").splitlines()[0]
         parts.append(f"## {exhibit.example[:2]} {title}\n")
-        # What is seen stands below, once; in place of a picture its name.
+        # The caption is given once, below; the alternative text of a picture is its name.
         for name in exhibit.pictures:
             parts.append(f"![{Path(name).stem.replace('_', ' ')}](gallery/{exhibit.kept_as(name)})")
         parts.append(f"\n{exhibit.seen} [{exhibit.example}.py](../examples/{exhibit.example}.py)\n")

@@ -2,11 +2,11 @@
 
     python scripts/size.py                 # this tree
     python scripts/size.py --against REV   # a revision beside it
-    python scripts/size.py --since REV     # product lines of files that stood at a revision, and of those added since
+    python scripts/size.py --since REV     # product lines of files that existed at a revision, and of those added since
     python scripts/size.py --folders       # product lines of each folder too
 
-Product is og_pointcloud, export and plugins; a line is a line, comments and docstrings too. Circles and upward imports
-are those of ``tests/test_import_order.py``, which says where each is.
+Product is og_pointcloud, export and plugins; every line counts, including comments and docstrings. Circles and upward
+imports are those of ``tests/test_import_order.py``, which says where each is.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def measure(root: Path) -> dict[str, int | str]:
 
 
 def lines_by_folder(root: Path) -> dict[str, int]:
-    """Product lines of each folder, those below it included; "og_pointcloud" is the modules at its root."""
+    """Product lines of each folder, including its subfolders; "og_pointcloud" is the modules at its root."""
     lines: dict[str, int] = {}
     for path in (path for folder in PRODUCT for path in (root / folder).rglob("*.py")):
         folder = "/".join(path.relative_to(root).parts[:2]) if path.parent.parent != root else path.parent.name
@@ -96,7 +96,7 @@ def lines_by_folder(root: Path) -> dict[str, int]:
 
 
 def lines_since(revision: str) -> dict[str, int]:
-    """Product lines of files that stood at a revision (by whatever name: git finds renames), and of those added."""
+    """Product lines of files that existed at a revision (under any name: git finds renames), and of those added."""
     command = ["git", "diff", "-M", "--diff-filter=A", "--name-only", revision, "--", *PRODUCT]
     names = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split()
     added = [ROOT / name for name in names if name.endswith(".py")]
@@ -114,7 +114,7 @@ def _ends(root: Path) -> tuple[str, str]:
 
 
 def path_between(edges: dict[str, dict[str, int]], start: str, end: str) -> list[str]:
-    """The modules on the shortest way of imports from one to the other, both included."""
+    """The modules on the shortest import path from one to the other, both included."""
     ways = [[start]]
     seen = {start}
     for way in ways:
@@ -148,5 +148,5 @@ def _count(paths: Iterator[Path] | list[Path]) -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as `| head` does: nobody reads on
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for `| head`, which closes the pipe
     main()

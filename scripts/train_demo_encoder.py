@@ -1,15 +1,15 @@
 """Trains the demo encoder: a tiny image encoder and a tiny text encoder that know the procedural room's things.
 
     python scripts/train_demo_encoder.py              # writes og_pointcloud/masking/demo_encoder, then measures it
-    python scripts/train_demo_encoder.py --measure    # measures the one that is there
+    python scripts/train_demo_encoder.py --measure    # measures the existing one
 
-Crops of some thousand masks of rendered rooms and the words for what they show are brought together by the usual
-contrastive loss; words for nothing in the room, many of them made up, compete. Half of the masks are those of a
-careless proposer that knows things, half what OpenCV proposes: pieces of things, of walls and of the floor with its
-shadows. The text side is a one-block CLIP text tower, exported like any other; the image side a small convolutional
-net. Rooms of other seeds than those of training are for measuring, and the demo's own (0, 1, 2 ...) are for neither.
+Crops of some thousand masks of rendered rooms and the words for what they show are aligned by the usual contrastive
+loss; words for nothing in the room, many of them made up, are negatives. Half of the masks come from a careless
+proposer that knows things, half from OpenCV: pieces of things, of walls and of the floor with its shadows. The text
+side is a one-block CLIP text tower, exported like any other; the image side is a small convolutional net. Measuring
+uses rooms of other seeds than training, and neither uses the demo's own (0, 1, 2 ...).
 
-It is a demo encoder: it knows these rooms, nineteen kinds of things and their synonyms, and nothing else of the world.
+It is a demo encoder: it knows these rooms, nineteen kinds of things and their synonyms, and nothing else.
 """
 
 from __future__ import annotations
@@ -59,24 +59,23 @@ KINDS = tuple(SYNONYMS)
 WALL, FLOOR = KINDS.index("wall"), KINDS.index("floor")
 NAMES = tuple(word for synonyms in SYNONYMS.values() for word in synonyms)
 CROPS = (Crop(1.15, 0.15), Crop(1.8, 0.5), Crop(4.0, 0.7))
-"""One shows the shape, one where the thing stands, one what a piece is a piece of."""
+"""One shows the shape, one the surroundings, one what a piece belongs to."""
 PROPOSALS = 40
-"""Masks of OpenCV's proposals that are taken of a view."""
+"""Number of OpenCV's masks taken per view."""
 FEWEST_PX, PUREST = 50, 0.5
-"""Masks of fewer pixels, or of which no more than this share shows one kind, teach nothing."""
+"""Masks with fewer pixels, or in which no kind fills more than this share, are not trained on."""
 PREPROCESSING = Preprocessing(48, mean=(0.486, 0.455, 0.408), std=(0.25, 0.25, 0.25), resample="bilinear")
 WIDTH, CONTEXT, TEXT_WIDTH, HEADS, MERGES = 64, 16, 64, 4, 600
 CHANNELS = ((3, 24, 5, 2), (24, 40, 3, 2), (40, 40, 3, 1), (40, 80, 3, 2), (80, 80, 3, 1), (80, 160, 3, 2))
-"""Of each convolution: channels in and out, size of its kernel, stride."""
+"""Per convolution: channels in and out, kernel size, stride."""
 BATCH, PHRASES, ABSENT, LEARNING_RATE = 64, 3, 140, 3e-3
 MADE_UP = 0.5
-"""Share of the words for nothing in the room that are no words at all."""
+"""Share of the words for nothing in the room that are not real words."""
 HUE_TURN = 0.5
-"""Radians, standard deviation, of every other mask's: things are bought in all colors, though wood and leaves are not.
-"""
+"""Standard deviation in radians, for every other mask: things come in all colors, though wood and leaves do not."""
 SHARPNESS, WORD_SHARPNESS = 16.0, 10.0
-"""Factors of the cosines in the contrastive loss, and in what keeps words apart: pieces of a table and of the floor
-look alike, but where the two words came close, each would count as the other's synonym when labels are judged."""
+"""Factors on cosines in the contrastive loss, and in the term that separates words: pieces of a table and of the floor
+look alike, but if the two words were close, each would count as the other's synonym when labels are judged."""
 
 TEMPLATES = (
     "{}", "{}", "{}", "{}.", "a {}", "the {}", "one {}", "my {}", "a photo of a {}", "a photo of the {}",
@@ -88,7 +87,7 @@ ADJECTIVES = (
     "old", "big", "wooden", "dark", "bright", "little", "round", "empty", "new", "nice",
 )  # fmt: skip
 NEW_TEMPLATES = ("a rendering of a {}", "there is a {} here", "a shiny turquoise {}", "look at these {}")
-"""For measuring: none of them is among those above."""
+"""For measuring: none of these is used above."""
 
 
 # Crops and what they show ---------------------------------------------------------------------------------------
@@ -104,14 +103,14 @@ class Crops:
     proposed: NDArray[np.bool_]
 
     def drawing_shares(self) -> NDArray[np.float64]:
-        """(M,) how often each is drawn: proposed ones as often as the others, rare kinds oftener than by number."""
+        """(M,) how often each is drawn: OpenCV's as often as the others, rare kinds more often than their number."""
         share = np.where(self.proposed, 1 / max(self.proposed.sum(), 1), 1 / max((~self.proposed).sum(), 1))
         share /= np.sqrt(np.bincount(self.kinds, share)[self.kinds])
         return share / share.sum()
 
 
 def room_crops(seed: int, views: int) -> Crops:
-    """Of a room: masks of a careless proposer, parts of them and of walls and floor, and some of OpenCV's proposals."""
+    """Crops of a room: masks of a careless proposer, parts of them and of walls and floor, and some of OpenCV's."""
     cv2.setNumThreads(1)
     rng = np.random.default_rng([2, seed])
     capture = make_capture(seed, CaptureSettings(views=views, samples_per_view=50))
@@ -130,8 +129,8 @@ def room_crops(seed: int, views: int) -> Crops:
 
 
 def rendered(seeds: Sequence[int], views: int, processes: int) -> Crops:
-    """Of many rooms, in the order of their seeds whichever process is done first."""
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # for what starts here: sums in one order
+    """Crops of many rooms, in the order of their seeds whichever process finishes first."""
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # for the child processes: sums in one order
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         rooms = list(pool.map(room_crops, seeds, [views] * len(seeds)))
     columns = zip(*((room.pixels, room.kinds, room.proposed) for room in rooms), strict=True)
@@ -139,14 +138,14 @@ def rendered(seeds: Sequence[int], views: int, processes: int) -> Crops:
 
 
 def opencv_masks(image: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
-    """The masks of all levels of what OpenCV proposes."""
+    """The masks of all levels that OpenCV proposes."""
     proposals = OpenCVProposer().propose(image)
     maps = [masks_of_level(proposals, level)[0] for level in LEVELS]
     return [ids == number for ids in maps for number in range(ids.max() + 1)]
 
 
 def _careless(ids: NDArray[np.uint16], kind: NDArray[np.int64], rng: Random) -> list[NDArray[np.bool_]]:
-    """The masks of a view, parts of four of them, and walls and floor or parts of these."""
+    """The masks of a view, parts of four of them, and walls and floor, or parts of these."""
     masks = [ids == number for number in range(1, int(ids.max()) + 1)]
     masks += [_part(masks[index], rng) for index in rng.permutation(len(masks))[:4]]
     for shell in (WALL, FLOOR):
@@ -182,8 +181,8 @@ def _cut(image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDAr
 
 @dataclass(frozen=True)
 class Words:
-    """absent: words for nothing in the room that training uses. kept: 25 more, of which it sees none. merges: the
-    tokenizer's, learnt from all words but these."""
+    """absent: words for nothing in the room, used in training. kept: 25 more, not used in training. merges: the
+    tokenizer's, learnt from all words except kept."""
 
     absent: tuple[str, ...]
     kept: tuple[str, ...]
@@ -191,7 +190,7 @@ class Words:
 
     @classmethod
     def drawn(cls, rng: Random) -> Words:
-        """From our everyday words, without those that a thing of the room may be called."""
+        """From our everyday words, without those that may name a thing of the room."""
         present = {word for words in SYNONYMS.values() for word in words} | set(RELATED)
         absent = [word for word in everyday_words() if word not in present]
         order = rng.permutation(len(absent)).tolist()
@@ -200,7 +199,7 @@ class Words:
         return cls(used, tuple(absent[index] for index in order[:25]), tuple(merges))
 
     def phrase(self, word: str, rng: Random) -> str:
-        """The word as someone may type it: plural, with an adjective, in a sentence. Adjectives say nothing here."""
+        """The word as someone may type it: plural, with an adjective, in a sentence. Adjectives have no meaning."""
         if rng.uniform() < 0.15:
             word = _plural(word)
         if rng.uniform() < 0.2:
@@ -208,20 +207,20 @@ class Words:
         return str(rng.choice(TEMPLATES)).replace("{}", word)
 
     def absent_phrase(self, rng: Random) -> str:
-        """A word for nothing in the room, every other one made up: what is unknown must be far from what is known,
-        and no list has all of that."""
+        """A word for nothing in the room, every other one made up: unknown words must be far from known ones, and no
+        list has them all."""
         word = self._made_up(rng) if rng.uniform() < MADE_UP else str(rng.choice(self.absent))
         return self.phrase(word, rng)
 
     @cached_property
     def _pieces(self) -> tuple[list[str], list[str]]:
-        """Of the tokenizer, those that go on, and those that end a word."""
+        """The tokenizer's pieces that continue a word, and those that end one."""
         pieces = [first + second for first, second in self.merges]
         ends = [piece.removesuffix("</w>") for piece in pieces if piece.endswith("</w>")]
         return [piece for piece in pieces if not piece.endswith("</w>")], ends
 
     def _made_up(self, rng: Random) -> str:
-        """Pieces of other words, or syllables, or a name of the room's things with two letters exchanged."""
+        """Pieces of other words, or syllables, or a name of the room's things with two letters swapped."""
         choice = rng.uniform()
         if choice < 0.5:
             pieces, ends = self._pieces
@@ -246,7 +245,7 @@ def _plural(word: str) -> str:
 
 
 def learnt_merges(texts: Iterable[str], count: int) -> list[tuple[str, str]]:
-    """Byte-pair merges of ASCII texts: again and again the pair that stands most often side by side."""
+    """Byte-pair merges of ASCII texts: repeatedly the most frequent adjacent pair."""
     counts = Counter(word for text in texts for word in text.lower().split())
     pieces = {word: [*word[:-1], f"{word[-1]}</w>"] for word in counts}
     merges: list[tuple[str, str]] = []
@@ -262,7 +261,7 @@ def learnt_merges(texts: Iterable[str], count: int) -> list[tuple[str, str]]:
 
 
 def tokenizer_json(merges: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """CLIP's tokenizer of these merges: ids are the 256 bytes, the bytes at a word's end, the merges, start, end."""
+    """CLIP's tokenizer with these merges: ids are the 256 bytes, the bytes at a word's end, the merges, start, end."""
     letters = sorted(BYTE_CHARACTERS, key=lambda character: (ord(character) >= 256, ord(character)))
     merges = list(merges)
     joined = ["".join(merge) for merge in merges]
@@ -286,7 +285,7 @@ def _merged(parts: list[str], pair: tuple[str, str]) -> list[str]:
 
 
 class Block(nn.Module):
-    """A transformer's block, its parts named as OpenCLIP names them."""
+    """A transformer block, with parts named as in OpenCLIP."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -296,8 +295,8 @@ class Block(nn.Module):
         self.mlp = nn.Sequential(OrderedDict(**layers, c_proj=nn.Linear(4 * TEXT_WIDTH, TEXT_WIDTH)))
 
     def forward(self, x: torch.Tensor, later: torch.Tensor) -> torch.Tensor:
-        """x: (B, T, W); later: (T, T), -inf where a token may not look. Attention as plain products: torch's own fixes
-        the number of texts when it is exported."""
+        """x: (B, T, W); later: (T, T), -inf where a token may not attend. Attention is in plain products: torch's own
+        fixes the number of texts when exported."""
         inputs = F.linear(self.ln_1(x), self.attn.in_proj_weight, self.attn.in_proj_bias)
         query, key, value = inputs.unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
         cosines = query @ key.transpose(2, 3) * (TEXT_WIDTH / HEADS) ** -0.5 + later
@@ -306,7 +305,7 @@ class Block(nn.Module):
 
 
 class TextEncoder(nn.Module):
-    """A one-block CLIP text tower. tokenizer: which also says how many tokens there are."""
+    """A one-block CLIP text tower. tokenizer: also gives the number of tokens."""
 
     def __init__(self, tokenizer: Tokenizer) -> None:
         super().__init__()
@@ -320,13 +319,13 @@ class TextEncoder(nn.Module):
         self.later = torch.full((CONTEXT, CONTEXT), -torch.inf).triu(1)
 
     def tokens(self, texts: Sequence[str]) -> torch.Tensor:
-        """(B, T) their ids; behind its end, the highest id, a text goes on with it."""
+        """(B, T) token ids; a text is padded with the end token, which has the highest id."""
         rows = [self.tokenizer(text) for text in texts]
         length = max(map(len, rows))
         return torch.tensor([row + row[-1:] * (length - len(row)) for row in rows])
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
-        """(B, WIDTH) unit rows of tokens (B, T). What stands behind a text's end does not count: none looks ahead."""
+        """(B, WIDTH) unit rows of tokens (B, T). Padding does not count, as no token attends to later ones."""
         length = tokens.shape[1]
         x = self.token_embedding(tokens) + self.positional_embedding[:length]
         for block in self.transformer["resblocks"]:  # type: ignore[union-attr]
@@ -336,7 +335,7 @@ class TextEncoder(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Six convolutions, their mean over the image, one matrix."""
+    """Six convolutions, a mean over the image, one matrix."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -356,7 +355,7 @@ class ImageEncoder(nn.Module):
 
 
 def train(crops: Crops, words: Words, steps: int, seed: int) -> tuple[TextEncoder, ImageEncoder]:
-    """Both encoders. A mask's vector is in training what it is in use, the mean of its crops' vectors."""
+    """Both encoders. As in use, a mask's vector in training is the mean of its crops' vectors."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 1])
     text = TextEncoder(open_tokenizer(json.dumps(tokenizer_json(words.merges)).encode(), CONTEXT, 1 << 16))
@@ -381,9 +380,9 @@ def train(crops: Crops, words: Words, steps: int, seed: int) -> tuple[TextEncode
 
 
 def contrastive_loss(images: torch.Tensor, kinds: torch.Tensor, texts: torch.Tensor) -> torch.Tensor:
-    """Images choose among all texts, words among all images, and words of different meaning keep apart.
+    """Images choose among all texts, words among all images, and words of different meaning are kept apart.
 
-    texts: PHRASES for each of KINDS, then those for nothing in the room, each a meaning of its own.
+    texts: PHRASES for each of KINDS, then those for nothing in the room, each with its own meaning.
     """
     named = len(KINDS) * PHRASES
     meaning = torch.cat([torch.arange(len(KINDS)).repeat_interleave(PHRASES), torch.arange(named, len(texts))])
@@ -396,8 +395,8 @@ def contrastive_loss(images: torch.Tensor, kinds: torch.Tensor, texts: torch.Ten
 
 
 def _varied(crops: NDArray[np.uint8], rng: Random) -> torch.Tensor:
-    """(B * crops, 3, S, S) of (B, crops, S, S, 3): each mask mirrored by chance, of another hue, brighter or darker, in
-    warmer or colder light."""
+    """(B * crops, 3, S, S) of (B, crops, S, S, 3): each mask randomly mirrored, with another hue, brighter or darker,
+    in warmer or colder light."""
     masks, size = len(crops), PREPROCESSING.size
     mirrored = rng.uniform(size=masks) < 0.5
     crops = np.where(mirrored[:, None, None, None, None], crops[:, :, :, ::-1], crops)
@@ -411,7 +410,7 @@ def _varied(crops: NDArray[np.uint8], rng: Random) -> torch.Tensor:
 
 
 def _hue_turns(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(B, 3, 3) rotations of RGB about grey by angles (B,), after Rodrigues."""
+    """(B, 3, 3) rotations of RGB about grey by angles (B,), by Rodrigues' formula."""
     grey = np.cross(np.eye(3), np.full(3, 3**-0.5))
     sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
     return np.eye(3) + sine * grey + versine * grey @ grey
@@ -421,7 +420,7 @@ def _hue_turns(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def export(text: TextEncoder, image: ImageEncoder, words: Words, folder: Path) -> None:
-    """Write both halves."""
+    """Write both encoders."""
     about = {
         "feature_space": DEMO_SPACE, "context_length": CONTEXT, "vocabulary": text.tokenizer.highest_id + 1,
         "pad_id": None, "templates": ["{}"], "tower": {"layers": 1, "heads": HEADS, "activation": "gelu"},
@@ -433,7 +432,7 @@ def export(text: TextEncoder, image: ImageEncoder, words: Words, folder: Path) -
 
 
 class RoundedImageModel(ImageModel):
-    """The image encoder as it is stored: norms folded into the convolutions, these in 8 bits, a scale a channel."""
+    """The image encoder as stored: norms folded into the convolutions, which have 8 bits and one scale per channel."""
 
     feature_space, width, preprocessing, crops, patch = DEMO_SPACE, WIDTH, PREPROCESSING, CROPS, None
 
@@ -449,7 +448,7 @@ class RoundedImageModel(ImageModel):
         self.head = image.head.weight.detach().numpy().T, image.head.bias.detach().numpy()
 
     def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """It has none."""
+        """Not available: it has no patches."""
         raise NotImplementedError
 
     @torch.no_grad()
@@ -500,7 +499,7 @@ class RoundedImageModel(ImageModel):
 
 
 def measure(folder: Path, views: int = 8) -> None:
-    """Prints what the encoder gets right in rooms it has not seen, with perfect, careless and OpenCV's masks."""
+    """Prints the encoder's accuracy in rooms it has not seen, with perfect, careless and OpenCV's masks."""
     words, text = Words.drawn(np.random.default_rng(0)), read_text_encoder(folder / "text")
     image = open_encoder(folder / "image")
     absent = (words.absent[:25], words.kept)
@@ -524,9 +523,9 @@ def measure(folder: Path, views: int = 8) -> None:
 
 
 def _is_hidden(mask: NDArray[np.bool_], depth_m: NDArray[np.float32]) -> bool:
-    """Whether a tenth of the mask's outline lies at the image's edge or against something nearer than it."""
+    """Whether a tenth of the mask's outline is at the image's edge or next to something nearer."""
     framed = np.pad(mask, 1)
-    depth = np.pad(depth_m, 1)  # beyond the edge everything is near
+    depth = np.pad(depth_m, 1)  # beyond the edge counts as nearer
     own = cv2.dilate(np.where(framed, depth, 0), np.ones((3, 3), np.uint8))
     outline = (own > 0) & ~framed
     return bool((depth[outline] < own[outline] - 0.03).mean() > 0.1)
@@ -569,7 +568,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="that render")
     parser.add_argument("--seed", type=int, default=0, help="of weights and choices, not of rooms")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # sums in one order: the same weights on every run of one machine
+    torch.set_num_threads(1)  # sums in a fixed order: the same weights on every run on one machine
     if not arguments.measure:
         start = time.perf_counter()
         crops = rendered(TRAINING_SEEDS, arguments.views, arguments.processes)

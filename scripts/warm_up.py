@@ -1,4 +1,4 @@
-"""Compiles the kernels into numba's cache, so that the first fit and file of a new installation do not wait for it."""
+"""Compiles the kernels into numba's cache, so that a new installation's first fit and first file do not wait for it."""
 
 import tempfile
 from pathlib import Path
@@ -11,7 +11,7 @@ from og_pointcloud.scene import Camera, Points, Scene, View
 
 
 def main() -> None:
-    """Fit a few points that three cameras see, and write them."""
+    """Fit a few points seen by three cameras, and write the file."""
     rng = np.random.default_rng(0)
     points = Points.from_world(rng.uniform(-1, 1, (200, 3)), rgb=rng.integers(0, 256, (200, 3), np.uint8))
     views = []

@@ -1,12 +1,12 @@
-"""Print the table of results for docs/results.md: every row is measured by the commands and the library's own scorers.
+"""Print the table of results for docs/results.md, measured with the commands and the library's own scorers.
 
     python scripts/write_results.py CAPTURE [CAPTURE ...] --rooms 0,1,2,3,4,5 --photographs 0,1
 
-A capture has gt.npz, text_features.npz and, where there is one, word_bank.npz. Rooms are those of ``og-pointcloud
-demo``, made once in the output folder; they share a line, whose interval is over rooms. With --photographs a room is
-labelled from its images alone: masks by OpenCV, features and typed words by the demo encoder; its seconds include the
-masks. Seconds are of the whole command, folder to file, in a process of its own, the least of the runs. The best
-baseline is the one with the highest mIoU of `og_pointcloud.evaluate.baselines`, with its remedy or without.
+A capture has gt.npz, text_features.npz and optionally word_bank.npz. Rooms are those of ``og-pointcloud demo``, made
+once in the output folder; they share a row, whose interval is over rooms. With --photographs a room is labelled from
+its images alone: masks by OpenCV, features and typed words by the demo encoder; its seconds include the masks. Seconds
+are of the whole command, folder to file, in its own process, the least of the runs. The best baseline is the one of
+`og_pointcloud.evaluate.baselines` with the highest mIoU, with or without its remedy.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _numbers(text: str) -> list[int]:
 
 
 def measure(folder: Path, runs: int = 1) -> Result:
-    """Fit a capture with the command, ask the file, score it; and the baselines on the same masks."""
+    """Fit a capture with the command, label it from the file, score it; and score the baselines on the same masks."""
     truth, words, scene = read_truth(folder), folder / WORDS, read_capture(folder)
     with tempfile.TemporaryDirectory() as temporary:
         bundle = Path(temporary) / "scene.ogpc"
@@ -102,28 +102,28 @@ def measure(folder: Path, runs: int = 1) -> Result:
 
 
 def timed(command: Sequence[str]) -> float:
-    """Seconds of one of the commands, in a process of its own."""
+    """Seconds of one of the commands, in its own process."""
     start = time.perf_counter()
     subprocess.run([*COMMAND, *command], stdout=subprocess.DEVNULL, check=True)
     return time.perf_counter() - start
 
 
 def rooms(seeds: Iterable[int], folder: Path) -> list[Path]:
-    """Captures of the demo's rooms, made where they are not there yet."""
+    """Captures of the demo's rooms, made if missing."""
     from og_pointcloud_room.capture import make_capture, write_capture  # pyright: ignore[reportMissingImports]
 
     made = [(seed, folder / f"room{seed}") for seed in seeds]
     for seed, room in made:
-        if not (room / "gt.npz").is_file():  # the last file that is written
+        if not (room / "gt.npz").is_file():  # the last file to be written
             write_capture(make_capture(seed), room)
     return [room for _, room in made]
 
 
 def photograph(room: Path, folder: Path) -> float:
-    """Make a capture of a room's images alone, with the words to score it by; seconds of its masks."""
+    """Make a capture from a room's images alone, with the words to score it by; returns the seconds for its masks."""
     truth = read_truth(room)
     seconds = timed(["masks", str(room), "--encoder", "demo", "--overwrite", "-o", str(folder)])
-    for name in (WORDS, BANK):  # links to the room's, which are of another encoder
+    for name in (WORDS, BANK):  # links to the room's files, which are another encoder's
         (folder / name).unlink(missing_ok=True)
     encoder = read_text_encoder(DEMO_ENCODER / "text")
     space = np.array(encoder.feature_space)
@@ -132,7 +132,7 @@ def photograph(room: Path, folder: Path) -> float:
 
 
 def mean_of_rooms(results: Sequence[Result]) -> Result:
-    """Rooms as one row: means, the interval over rooms; of the baselines each room's best."""
+    """Rooms as one row: means, the interval over rooms; the mean of each room's best baseline."""
     known = [result.background for result in results if result.background is not None]
     return Result(
         scene=f"mean of {len(results)} demo rooms",
@@ -145,7 +145,7 @@ def mean_of_rooms(results: Sequence[Result]) -> Result:
 
 
 def table(results: Iterable[Result]) -> str:
-    """Markdown, the first column left, the others right."""
+    """Markdown: the first column left-aligned, the others right-aligned."""
     lines = [HEADER, ("---", *["---:"] * (len(HEADER) - 1))]
     for one in results:
         background = "-" if one.background is None else f"{one.background:.3f}"

@@ -1,11 +1,11 @@
 """Walks a camera through the room and writes what it sees as a capture folder, with exact ground truth.
 
-The same seed gives the same room on every machine: what is drawn at random never depends on what was seen before, so
-that the one pixel in a million that a processor rounds to another object changes itself alone.
+The same seed gives the same room on every machine: random draws never depend on what was seen before, so that the one
+pixel in a million that a processor rounds to another object affects nothing else.
 
 The folder: ``images/`` . ``transforms.json`` (nerfstudio: camera-to-world, OpenGL axes) . ``points.ply`` (a fused
 cloud from noisy depth) . ``masks/<stem>.png`` (uint16, 0 none, ids local to the image) . ``mask_features.npz`` .
-``text_features.npz`` . ``word_bank.npz`` . ``gt.npz`` (for scoring alone).
+``text_features.npz`` . ``word_bank.npz`` . ``gt.npz`` (for scoring only).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from og_pointcloud_room.shapes import rotated
 
 Random = np.random.Generator
 FLYING = -2
-"""Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""
+"""Source of a sample on no surface: interpolated across a depth edge, or an outlier."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 ABSENT_WORDS = 50
 TOUCHING_M = 1e-4
 """Two surfaces whose distances from a point differ by less are equally near."""
 PATH, CLOUD, MASKS, FEATURES, TEXTURE, WORDS = range(1, 7)
-"""Streams of random numbers, beside that of the furniture; cloud, masks and features have one a view."""
+"""Random number streams besides that of the furniture; cloud, masks and features have one per view."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class CaptureSettings:
     """views: images along the path. width, height: pixels. voxel_m: one point is kept per cube of this side.
 
     mask_noise: 0 for perfect masks and features of the right class, 1 for the default errors of
-    :class:`~og_pointcloud_room.masks.MaskNoise`, more for worse. Masks are numbered at random in every view anyway.
+    :class:`~og_pointcloud_room.masks.MaskNoise`, more for worse. Masks are numbered at random in every view regardless.
     depth_noise: multiple of a structured-light sensor's noise, 1.2 mm + 1.9 mm (z - 0.4 m)^2 / m^2 (Nguyen 2012).
-    range_m: depth beyond it is discarded, as fusions do.
+    range_m: depth beyond it is discarded, as fusion does.
     samples_per_view: pixels of each view that enter the cloud. flying: share of the samples at depth edges that are
-    interpolated between front and back. outliers: share of samples anywhere in the room.
+    interpolated between front and back. outliers: share of samples placed anywhere in the room.
     """
 
     views: int = 60
@@ -64,14 +64,14 @@ class CaptureSettings:
 
 @dataclass(frozen=True)
 class RoomCapture:
-    """All that a capture folder holds, and the truth.
+    """The contents of a capture folder, and the truth.
 
     masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 meters, rgb (n, 3)
     uint8. cls, instance: (n,) int32 class and object of each point, -1 where it has none; background: (n,) bool, on
     walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
-    outlier, or noise that carried the point over to another surface. bank_vectors: (B, 512) float32, our everyday
-    words, those of the room's things among them; absent_vectors: (50, 512) float32, words that nothing in it is.
-    names: of the classes. views: (n,) int32, how many views see each point; None: not counted.
+    outlier, or a point that noise moved to another surface. bank_vectors: (B, 512) float32, our everyday words,
+    including those for the room's things; absent_vectors: (50, 512) float32, words for nothing in it. names: of the
+    classes. views: (n,) int32, how many views see each point; None: not counted.
     """
 
     room: Room
@@ -92,14 +92,14 @@ class RoomCapture:
 
     @property
     def mask_instance(self) -> NDArray[np.int32]:
-        """(masks of all views,) the object that each mask shows most of, -1 where it shows none."""
+        """(masks of all views,) the object that fills most of each mask, -1 where it shows none."""
         views = zip(self.masks, self.frames, strict=True)
         areas = np.concatenate([_area_px(ids, frame.owner, len(self.room.objects)) for ids, frame in views])
         return np.where(areas.any(axis=1), areas.argmax(axis=1), -1).astype(np.int32)
 
 
 def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> RoomCapture:
-    """Furnish, walk, sense, mask and describe: the same seed and settings give the same arrays."""
+    """Furnish, walk, sense, mask and describe; the same seed and settings give the same arrays."""
     settings = settings or CaptureSettings()
     noise = MaskNoise().scaled(settings.mask_noise)
     room = furnish(seed)
@@ -127,7 +127,7 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
 
 
 def everyday_vectors(model: FeatureModel, names: tuple[str, ...], rng: Random) -> NDArray[np.float32]:
-    """(B, 512) float32: what the encoder makes of our everyday words; of those that name a class, that class's text."""
+    """(B, 512) float32: the encoder's vectors of our everyday words; for a class's name, that class's text."""
     everyday = everyday_words()
     bank = model.words(len(everyday), rng)
     for name, vector in zip(names, model.texts, strict=True):
@@ -144,9 +144,9 @@ def _stream(seed: int, purpose: int, *view: int) -> Random:
 
 
 def walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArray[np.float64]]:
-    """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards.
+    """Two hand-held rounds: the first along the furniture looking across, the second in the middle looking outwards.
 
-    The hand goes up and down on the way, to look under and onto things, as one does when scanning a room.
+    The hand moves up and down on the way, to look under and onto things, as when scanning a room.
     """
     half = np.array(room.size[:2]) / 2
     start = rng.uniform(0, 2 * np.pi)
@@ -173,7 +173,7 @@ def walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArra
 
 
 def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
-    """(4, 4) camera-to-world, OpenCV axes, z up in the world; rounded to what sines of all processors agree on."""
+    """(4, 4) camera-to-world, OpenCV axes, z up in the world; rounded to digits that all processors' sines agree on."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0, 0, 1.0))
     right /= np.linalg.norm(right)
@@ -201,8 +201,8 @@ def _fused_cloud(
     rgb = np.concatenate([rgb, rng.integers(0, 256, (count, 3), np.uint8)])
     source = np.concatenate([source, np.full(count, FLYING, np.int32)])
     in_range = np.concatenate([in_range, np.ones(count, bool)])
-    # Of each voxel the first sample in random order is kept; a voxel's key has 20 bits for each coordinate. The order
-    # is drawn for all samples, so that one at the limit of the range does not change that of the others.
+    # The first sample in random order is kept per voxel; a voxel's key has 20 bits for each coordinate. The order is
+    # drawn for all samples, so that one at the limit of the range does not change the order of the others.
     order = rng.permutation(len(xyz))
     order = order[in_range[order]]
     cell = np.floor(xyz[order] / settings.voxel_m).astype(np.int64) + 2**19
@@ -219,7 +219,7 @@ def _sense(
     xyz (k, 3), rgb (k, 3), the object that each was sensed on, and whether it lies within the sensor's range.
     """
     pixel = rng.choice(frame.depth_m.size, min(settings.samples_per_view, frame.depth_m.size), replace=False)
-    # A depth edge: the nearest and the farthest of the pixels about differ by more than a twentieth.
+    # A depth edge: the nearest and the farthest of the surrounding pixels differ by more than a twentieth.
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(frame.depth_m, window).ravel()[pixel], cv2.dilate(frame.depth_m, window).ravel()[pixel]
     depth_m = frame.depth_m.ravel()[pixel].astype(np.float64)
@@ -236,7 +236,7 @@ def ground_truth(
     room: Room, surfaces: Surfaces, xyz: NDArray[np.float32], source: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """instance (n,) int32 and background (n,) bool: known where no surface is nearer than that of the ray's target."""
-    # Noise may carry a point to another surface: then it is not the nearest to its own object, and has no truth.
+    # Noise may move a point to another surface: then its own object is not the nearest, and it has no truth.
     nearest_m, own_m = surfaces.distance_m(xyz), np.full(len(xyz), np.inf, np.float32)
     for owner in np.unique(source[source != FLYING]):
         items = room.shell if owner == BACKGROUND else (room.objects[owner],)
@@ -252,10 +252,10 @@ def mask_features(
     ids: NDArray[np.uint16], owner: NDArray[np.int32], class_of_object: NDArray[np.int32],
     looks: NDArray[np.float64], model: FeatureModel, wrong_class: float, rng: Random,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """(M, 512) float32 unit rows: what an image encoder says of each mask.
+    """(M, 512) float32 unit rows: an image encoder's feature of each mask.
 
-    A mask over several objects gets the mean of their features by area (a share below a tenth goes unnoticed); a mask
-    on bare background, or one that the encoder gets wrong, that of a random class.
+    A mask over several objects gets the area-weighted mean of their features (shares below a tenth are ignored); a mask
+    on bare background, or one that the encoder gets wrong, gets the feature of a random class.
     """
     area_px = _area_px(ids, owner, len(class_of_object))
     features = np.empty((len(area_px), model.texts.shape[1]), np.float32)
@@ -270,7 +270,7 @@ def mask_features(
 
 
 def _area_px(ids: NDArray[np.uint16], owner: NDArray[np.int32], objects: int) -> NDArray[np.int64]:
-    """(M, objects): pixels that each mask of a view has on each object."""
+    """(M, objects): number of pixels of each mask of a view on each object."""
     pair = ids.astype(np.int64) * (objects + 1) + owner + 1  # column 0: no object, row 0: no mask
     masks = int(ids.max()) + 1
     return np.bincount(pair.ravel(), minlength=masks * (objects + 1)).reshape(masks, objects + 1)[1:, 1:]
@@ -319,7 +319,7 @@ def _transforms(capture: RoomCapture, stems: list[str]) -> dict[str, object]:
 
 
 def _write_ply(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
-    """By Open3D, so that the generator shares no code with the reader that it tests."""
+    """Written by Open3D, so that the generator shares no code with the reader that it tests."""
     cloud: Any = o3d.t.geometry.PointCloud(tensor(xyz))
     cloud.point.colors = tensor(rgb, np.uint8)
     if not o3d.t.io.write_point_cloud(path, cloud):

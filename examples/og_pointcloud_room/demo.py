@@ -1,4 +1,4 @@
-"""The demo: the procedural room captured, fitted, written to one file, asked by words, scored and drawn.
+"""The demo: the procedural room captured, fitted, written to one file, queried by words, scored and drawn.
 
 Twice: with the masks and features of a simulated proposer and encoder, and from the photographs alone.
 """
@@ -29,14 +29,14 @@ from og_pointcloud_room.pictures import draw_clouds, draw_views
 from og_pointcloud_room.stages import stage
 
 SHOWN_VIEWS = (0.0, 0.2, 0.62, 0.82)
-"""Where along the path the views of the contact sheet lie."""
+"""Positions along the path of the views on the contact sheet."""
 
 
 @dataclass(frozen=True)
 class MethodScore:
     """One row of the demo's table.
 
-    absent_called: of all points, the share that gets a label when it is asked for words that nothing in the room is.
+    absent_called: share of all points that get a label when the words name nothing in the room.
     seconds: wall clock from the scene in memory to a label per point; None if given.
     """
 
@@ -50,9 +50,9 @@ class MethodScore:
 class DemoResult:
     """What the demo wrote and measured.
 
-    methods: direct uplift, og_pointcloud, ceiling, and, if asked for, og_pointcloud from photographs.
-    share_of_the_way: of the distance in mIoU from uplift to ceiling, how much og_pointcloud covers (NaN where uplift is
-    already at the ceiling). instance_agreement: adjusted Rand index of its instances with the true ones, on labelled
+    methods: direct uplift, og_pointcloud, ceiling, and, on request, og_pointcloud from photographs.
+    share_of_the_way: share of the mIoU difference between uplift and ceiling that og_pointcloud gains (NaN where uplift
+    is already at the ceiling). instance_agreement: adjusted Rand index of its instances with the true ones, on labelled
     points. seconds: wall clock per stage of the demo.
     """
 
@@ -68,9 +68,9 @@ class DemoResult:
 def run_demo(
     output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: bool = True, photographs: bool = False
 ) -> DemoResult:
-    """Makes a room in ``output``/capture, fits it, writes ``output``/room.ogpc, asks it for every class and scores it.
+    """Makes a room in ``output``/capture, fits it, writes ``output``/room.ogpc, labels it by all classes and scores it.
 
-    seed: another room. mask_noise: 0 for a perfect proposer, 1 the default, more for worse. pictures: also draw
+    seed: of the room. mask_noise: 0 for a perfect proposer, 1 the default, more for worse. pictures: also draw
     views.png, instances.png and labels.png, where PyVista can render off-screen. photographs: also label the room from
     its images alone, masks by OpenCV, features and typed words by the demo encoder, into ``output``/photographs.
     Prints one line per stage and a table.
@@ -123,7 +123,7 @@ def ceiling(
     features: NDArray[np.floating], mask_instance: NDArray[np.integer], texts: NDArray[np.floating],
     instances: NDArray[np.integer],
 ) -> NDArray[np.int32]:  # fmt: skip
-    """The best that masks allow: true instances, each with the mean feature of the masks that show mostly it.
+    """The best that masks allow: true instances, each with the mean feature of the masks that mostly show it.
 
     features: (M, D) unit rows; mask_instance: (M,) the true instance that each mask mostly shows, -1 for background;
     texts: (C, D) unit rows; instances: (n,) true instance of each point, -1 none. Returns (n,) int32 class ids, -1 off
@@ -140,12 +140,12 @@ def ceiling(
 def _absent_called(scene: og.LabelledScene, capture: RoomCapture) -> float:
     absent = {f"absent {number}": vector for number, vector in enumerate(capture.absent_vectors)}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that no point has a label is what is hoped for
+        warnings.simplefilter("ignore")  # warns that no point has a label, as hoped
         return float((og.segment(capture.xyz, absent, scene=scene).labels >= 0).mean())
 
 
 def _baselines(prepared: Prepared, render_s: float, capture: RoomCapture) -> tuple[MethodScore, MethodScore]:
-    """Direct uplift on the mask table that the fit works on, and the ceiling on the truth."""
+    """Direct uplift from the fit's own mask table, and the ceiling from the truth."""
     features = np.concatenate(capture.mask_features)
 
     def plain(texts: NDArray[np.floating]) -> NDArray[np.integer]:
@@ -171,7 +171,7 @@ def _score(labels: NDArray[np.integer], capture: RoomCapture) -> Score:
 def _draw(
     output: Path, capture: RoomCapture, scene: og.LabelledScene, result: og.Segmentation, seen: FromPhotographs | None
 ) -> tuple[Path, ...]:
-    """The pictures, or those of images alone where nothing can be rendered."""
+    """Draw the pictures; only the input views where nothing can be rendered."""
     from og_pointcloud_pyvista import can_render
 
     views = output / "views.png"
@@ -181,7 +181,7 @@ def _draw(
     if not can_render():
         print("no pictures of the cloud: off-screen rendering needs EGL or OSMesa (Debian: apt install libegl1 libgl1)")
         return written
-    # Flying pixels and outliers have no truth to be held against; they are shown among the instances.
+    # Flying pixels and outliers have no truth to compare with; they are shown among the instances.
     known, rgb = (capture.cls >= 0) | capture.background, capture.rgb
     truth = {"ground truth": replace(result, labels=capture.cls, instances=capture.instance)}
     by_instance = draw_clouds(output / "instances.png", scene, {"instances": result}, rgb, by="instance")

@@ -1,8 +1,8 @@
 """Models of furniture and of the things that stand on it, drawn from a random generator.
 
 Single things (``mug``, ``book`` ...) return one :class:`Item` standing on the origin. Groups (``sofa_group`` ...)
-return furniture together with what lies on it, in a frame with the floor at z = 0, the footprint centered on the
-origin, and the back, which goes to the wall, at +y.
+return furniture with the things on it, in a frame with the floor at z = 0, the footprint centered on the origin, and
+the back, which goes to the wall, at +y.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Item:
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """(3,) of the box around it."""
+        """(3,) center of its bounding box."""
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
     def moved(self, offset: ArrayLike, yaw: float = 0.0) -> Item:
@@ -75,11 +75,11 @@ def wood(rng: Random) -> Material:
 
 
 HUES = (0.0, 0.04, 0.11, 0.14, 0.22, 0.33, 0.46, 0.55, 0.6, 0.66, 0.93)
-"""Hues of things people buy: reds, ochres, greens, teal, blues, rose."""
+"""Common hues of household things: reds, ochres, greens, teal, blues, rose."""
 
 
 def fabric(rng: Random) -> Material:
-    """Mottled, of a muted hue."""
+    """Mottled, with a muted hue."""
     hue, saturation, value = rng.choice(HUES), rng.uniform(0.25, 0.65), rng.uniform(0.45, 0.85)
     return Material(_tint(hue, saturation, value), _tint(hue + 0.03, saturation, value * 0.75), (0.04, 0.04, 0.04))
 
@@ -237,7 +237,7 @@ def arranged(
     rng: Random, makers: Sequence[Callable[[Random], Item]], center: Sequence[float], size: Sequence[float],
     cells: tuple[int, int],
 ) -> list[Item]:  # fmt: skip
-    """Things on a surface, each in a grid cell of its own so that none touch. center (x, y, z), size (x, y) meters."""
+    """Things on a surface, each in its own grid cell so that none touch. center (x, y, z), size (x, y) meters."""
     columns, rows = cells
     chosen = rng.permutation(columns * rows)[: len(makers)]
     items = []
@@ -328,7 +328,7 @@ def shelf_group(rng: Random) -> Group:
 
 
 def small_vase_or_bottle(rng: Random) -> Item:
-    """Either, by chance."""
+    """One or the other, at random."""
     return vase(rng) if rng.uniform() < 0.5 else bottle(rng)
 
 

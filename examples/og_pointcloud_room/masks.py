@@ -1,6 +1,6 @@
-"""What a mask proposer makes of a view: unnumbered, ragged, split, merged, missing and spurious masks.
+"""A simulated mask proposer: randomly numbered, ragged, split, merged, missing and spurious masks.
 
-Distances and the wandering of edges are exact or elementwise here, not OpenCV's, which rounds as the processor likes.
+Distances and edge noise are computed exactly or elementwise, not by OpenCV, whose rounding depends on the processor.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class MaskNoise:
     split: chance that a visible object comes as two or three masks. merge: chance that it is joined with an object it
     touches in the image. miss: chance that it has no mask. spurious: chance that a view has a mask on bare wall or
     floor. wrong_class: chance that a mask's feature is that of another class. edge_px: how far edges wander, pixels.
-    smallest_share: masks below this share of the image are dropped. swallow: chance that what has no mask lies in that
-    of something larger, the one it touches most, as a cup in its table's; else that mask has a hole there.
+    smallest_share: masks below this share of the image are dropped. swallow: chance that an object without a mask lies
+    in the mask of the larger thing it touches most, as a cup in its table's; else that mask has a hole there.
     """
 
     split: float = 0.15
@@ -38,7 +38,7 @@ class MaskNoise:
     swallow: float = 0.0
 
     def scaled(self, level: float) -> MaskNoise:
-        """The same proposer with every chance and the edges' wandering times ``level`` (0: perfect masks)."""
+        """The same proposer with every chance and ``edge_px`` times ``level`` (0: perfect masks)."""
         if not level >= 0:
             raise OgPointcloudError(f"mask noise is {level}; expected 0 (perfect masks) or more (1: the default noise)")
         names = ("split", "merge", "miss", "spurious", "wrong_class")
@@ -51,7 +51,7 @@ def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> ND
 
     owner: (H, W) int32, the object seen at each pixel, -1 for walls, floor and ceiling.
     """
-    # A proposer's errors one after another: joined, missing, split and spurious masks.
+    # A proposer's errors in turn: joined, missing, split and spurious masks.
     regions = [owner == instance for instance in np.unique(owner[owner >= 0])]
     regions = _merged(regions, noise.merge, rng)
     regions = _found(regions, noise, rng)
@@ -60,7 +60,7 @@ def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> ND
     ]
     if rng.uniform() < noise.spurious:
         regions.append(_blob(owner, rng))
-    # Numbered and painted in random order: of masks that overlap at their edges either may lie on top.
+    # Numbered and painted in random order: where masks overlap at their edges, either may be on top.
     ids = np.zeros(owner.shape, np.uint16)
     for rank, index in enumerate(rng.permutation(len(regions))):
         _paint(ids, regions[index], rank + 1, noise.edge_px, rng)
@@ -82,7 +82,7 @@ def _merged(regions: list[NDArray[np.bool_]], chance: float, rng: Random) -> lis
 
 
 def _found(regions: list[NDArray[np.bool_]], noise: MaskNoise, rng: Random) -> list[NDArray[np.bool_]]:
-    """The regions that are not missed, some of them with what was missed within them."""
+    """The regions that are not missed, some of them including missed ones that they touch."""
     found = [rng.uniform() >= noise.miss for _ in regions]
     kept = {index: regions[index] for index in np.flatnonzero(found).tolist()}
     for index in np.flatnonzero(~np.array(found, bool)).tolist() if noise.swallow else []:
@@ -98,7 +98,7 @@ def _found(regions: list[NDArray[np.bool_]], noise: MaskNoise, rng: Random) -> l
 def _split(region: NDArray[np.bool_], rng: Random) -> list[NDArray[np.bool_]]:
     """Two or three parts: the cells of random pixels of the region."""
     pixels = np.argwhere(region)
-    places = rng.uniform(size=rng.integers(2, 4))  # shares of the list, so that a pixel more moves no seed far
+    places = rng.uniform(size=rng.integers(2, 4))  # shares of the list, so that one more pixel moves no seed far
     seeds = pixels[(places * len(pixels)).astype(int)]
     nearest = ((pixels[:, None] - seeds[None]) ** 2).sum(axis=2).argmin(axis=1)
     parts = []
@@ -110,7 +110,7 @@ def _split(region: NDArray[np.bool_], rng: Random) -> list[NDArray[np.bool_]]:
 
 
 def _blob(owner: NDArray[np.int32], rng: Random) -> NDArray[np.bool_]:
-    """A small ellipse on the background, of one to three hundredths of the image's area."""
+    """A small ellipse on the background, one to three hundredths of the image's area."""
     height, width = owner.shape
     rows, columns = np.nonzero(owner < 0)
     blob = np.zeros(owner.shape, np.uint8)
@@ -142,12 +142,12 @@ def _paint(ids: NDArray[np.uint16], region: NDArray[np.bool_], number: int, edge
 
 
 def _distance_px(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Of each pixel to the nearest one outside; as far as the picture is large where none is."""
+    """Distance of each pixel to the nearest one outside; the picture's size where there is none."""
     return distance_transform_edt(inside) if not inside.all() else np.full(inside.shape, float(sum(inside.shape)))
 
 
 def _enlarged(coarse: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(rows, columns) between the values of ``coarse``, which stand 8 pixels apart, by linear interpolation."""
+    """(rows, columns) linearly interpolated from the values of ``coarse``, which are 8 pixels apart."""
     (row, down), (column, right) = (np.divmod(at, 8) for at in (rows, columns))
     down, right = down[:, None] / 8, right[None] / 8
     upper = coarse[np.ix_(row, column)] * (1 - right) + coarse[np.ix_(row, column + 1)] * right
@@ -156,7 +156,7 @@ def _enlarged(coarse: NDArray[np.float64], rows: NDArray[np.int64], columns: NDA
 
 
 def _without_tiny(ids: NDArray[np.uint16], smallest_px: float) -> NDArray[np.uint16]:
-    """Masks below ``smallest_px`` pixels dropped, the others numbered 1..M in the order that they had."""
+    """Masks below ``smallest_px`` pixels dropped, the others renumbered 1..M in the same order."""
     counts = np.bincount(ids.ravel())
     kept = np.flatnonzero(counts[1:] >= max(smallest_px, 1)) + 1
     table = np.zeros(len(counts), np.uint16)

@@ -1,7 +1,7 @@
 """The demo from photographs alone: images -> masks -> features -> fit -> one file -> typed words -> labels.
 
 Masks come from a proposer that needs no weights, features and words from the demo encoder that comes with the library:
-nothing is simulated but the room, and nothing is fetched. The truth is used for scoring alone.
+only the room is simulated, and nothing is downloaded. The truth is used for scoring only.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ ABSENT = (
     "hovercraft", "iceberg", "igloo", "jellyfish", "parachute", "periscope", "pyramid", "rocket", "snorkel",
     "stethoscope", "tarantula", "unicycle", "volcano", "walrus", "zeppelin",
 )  # fmt: skip
-"""Words for nothing in the room, typed as well. The demo encoder was not trained on any of them."""
+"""Words for nothing in the room, queried as well. The demo encoder was not trained on any of them."""
 
 
 @dataclass(frozen=True)
 class FromPhotographs:
-    """What came of it. masks: of all images. result: the room's points asked for CLASS_NAMES. absent_called: of all
-    points, the share that gets one of ABSENT when these are asked. preview: some images with their masks drawn in.
-    seconds: wall clock per stage."""
+    """The outcome. masks: of all images. result: the room's points labelled by CLASS_NAMES. absent_called: share of all
+    points that get a label when labelled by ABSENT. preview: some images with their masks drawn in. seconds: wall clock
+    per stage."""
 
     bundle: Path
     masks: int
@@ -48,11 +48,11 @@ class FromPhotographs:
 
 
 def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv", seed: int = 0) -> FromPhotographs:
-    """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
+    """Label a capture of a room, from ``write_capture``, by the names of its classes as typed words.
 
-    Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
-    masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
-    the capture's own ``masks`` folder for those of the demo's simulated proposer.
+    Only images, poses, points and the truth of the capture are used; ``output`` becomes a separate capture with the
+    masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as for `og-pointcloud masks`;
+    or the capture's own ``masks`` folder for the masks of the demo's simulated proposer.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv"
         loaded = og.load(bundle)
         result = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that no point has a label is what is hoped for
+        warnings.simplefilter("ignore")  # warns that no point has a label, as hoped
         called = float((og.segment(loaded, ABSENT).labels >= 0).mean())
     score = score_labels(result.labels, truth.cls, background=truth.background)
     return FromPhotographs(bundle, made.masks, result, score, called, output / PREVIEW_NAME, seconds)

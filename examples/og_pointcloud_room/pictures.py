@@ -19,17 +19,17 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 CUT_M = 2.3
-"""Points above are cut away, so that one sees into the room; meters above the floor."""
+"""Points above this are cut away to show the inside of the room; meters above the floor."""
 WALL_M = 0.15
-"""What lies nearer than this to the end of the room is a wall, or hangs on one."""
+"""Points nearer than this to the end of the room are a wall, or hang on one; meters."""
 STEP_BACK = 1.15
-"""Of the eye, so that walls and what hangs on them are in the picture too."""
+"""Factor on the eye's distance, so that walls and what hangs on them are in the picture too."""
 DRAWN_SIZE, PICTURE_WIDTH = (1600, 1000), 1000
-"""Pixels as drawn; and across, as shown."""
+"""Pixels as drawn, and the width as shown."""
 CLOSED = 4.5
 """Width of a point in point spacings, so that surfaces close; smoothing halves it."""
 ASIDE = 0.12
-"""How far the scene is moved to the left, in half widths: the legend is on the right."""
+"""How far the scene is shifted left, in half widths, as the legend is on the right."""
 
 Colors = NDArray[np.uint8]
 
@@ -58,7 +58,7 @@ def draw_clouds(
     path: Path, scene: LabelledScene, results: dict[str, Segmentation], rgb: Colors,
     known: NDArray[np.bool_] | None = None, *, by: str = "label",
 ) -> Path:  # fmt: skip
-    """Answers about one cloud beside each other, each under its title. Needs PyVista that can render off-screen.
+    """Results for one cloud side by side, each under its title. Needs PyVista with off-screen rendering.
 
     rgb: (N, 3) colors of the points, which shade those of the labels. known: (N,) points to draw; all if left out.
     by: "label" or "instance".
@@ -90,7 +90,7 @@ def draw_clouds(
 
 
 def _look_into_room(result: Segmentation) -> tuple[NDArray[np.bool_], Viewpoint]:
-    """(N,) which points to show, and where from: the things in the room decide, then walls before the eye go."""
+    """(N,) which points to show, and the viewpoint, chosen by the things in the room; walls before the eye are cut."""
     xyz = result.xyz
     lower, upper = np.percentile(xyz, (0.5, 99.5), axis=0)
     middle, half = (lower + upper) / 2, (upper - lower) / 2

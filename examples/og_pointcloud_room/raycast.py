@@ -1,8 +1,8 @@
-"""Sees the room: ray casting with Open3D, shading, and the distance from any point to the true surfaces.
+"""Views of the room: ray casting with Open3D, shading, and the distance from any point to the true surfaces.
 
-Embree, inside Open3D, rounds as the processor likes. So it only says which triangle a ray meets; where on it is worked
-out here in float64, without matrix products, whose order of summation depends on the processor too. That makes depth,
-color and all that follows the same on every machine, but for single pixels on an object's outline.
+The rounding of Embree, inside Open3D, depends on the processor. So it only tells which triangle a ray meets; where on
+it is computed here in float64, without matrix products, whose order of summation depends on the processor too. That
+makes depth, color and everything derived the same on every machine, except for single pixels on an object's outline.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ except ImportError as error:
 Points = NDArray[np.float64]
 BACKGROUND = -1
 NOISE_SIDE, NOISE_STEPS = 128, 8
-"""Cells along a side of the noise table, and cells to a grain of a material."""
+"""Cells along a side of the noise table, and cells per grain of a material."""
 FILL_LIGHTS = (((0.3, -0.5, 0.8), 0.25), ((-0.8, 0.5, 0.33), 0.14), ((0.6, 0.8, 0.0), 0.08), ((0.1, 0.2, -0.97), 0.08))
-"""Directions towards and strengths of the lights that cast no shadow: window, bounce from the wall, from the floor."""
+"""Direction towards, and strength of, the lights without shadows: window, bounce from the wall, from the floor."""
 
 
 class Hits(NamedTuple):
-    """What n rays meet. part: (n,) int64 among all parts of all items, -1 for nothing; distance: (n,) float64 in
+    """What n rays hit. part: (n,) int64 among all parts of all items, -1 for nothing; distance: (n,) float64 in
     lengths of the ray's direction, NaN for nothing; normal: (n, 3) float64 unit, against the ray."""
 
     part: NDArray[np.int64]
@@ -49,7 +49,7 @@ class Surfaces:
     def __init__(self, items: Iterable[Item]) -> None:
         self._scene = o3d.t.geometry.RaycastingScene()
         owners, corners = [], []
-        # Open3D numbers geometries in the order in which they are added, and triangles within each from 0.
+        # Open3D numbers geometries in the order they are added, and triangles within each from 0.
         for index, item in enumerate(items):
             for part in item.parts:
                 self._scene.add_triangles(tensor(part.vertices), tensor(part.triangles, np.uint32))
@@ -57,7 +57,7 @@ class Surfaces:
                 corners.append(part.vertices[part.triangles])
         self.part_item = np.array(owners)
         self._first_triangle = np.cumsum([0, *map(len, corners)])
-        # Each triangle's plane, normal . x = offset: where a ray meets it is computed from these.
+        # Each triangle's plane, normal . x = offset, from which the point where a ray meets it is computed.
         first, second, third = np.concatenate(corners).transpose(1, 0, 2)
         across = np.cross(second - first, third - first)
         self._normal = across / np.maximum(np.sqrt(_dot(across, across)), 1e-12)[:, None]
@@ -68,7 +68,7 @@ class Surfaces:
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=1)
         found = self._scene.cast_rays(tensor(rays))
         part = found["geometry_ids"].numpy().astype(np.int64)
-        missed = part >= len(self.part_item)  # Open3D says "none" by its largest id
+        missed = part >= len(self.part_item)  # Open3D's largest id means "none"
         part[missed] = -1
         triangle = self._first_triangle[part] + np.where(missed, 0, found["primitive_ids"].numpy())
         triangle[missed] = 0
@@ -77,7 +77,7 @@ class Surfaces:
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (offset - _dot(normal, np.asarray(origin))) / steepness
         distance[missed] = np.nan
-        return Hits(part, distance, normal * -np.sign(steepness)[:, None])  # triangles are wound either way
+        return Hits(part, distance, normal * -np.sign(steepness)[:, None])  # triangles may be wound either way
 
     def is_blocked(self, starts: Points, steps: Points) -> NDArray[np.bool_]:
         """(n,) whether a surface lies between ``starts`` and ``starts + steps``, both (n, 3)."""
@@ -150,20 +150,20 @@ class RayCaster:
             raise ValueError(f"{int((hits.part < 0).sum())} rays leave the room; expected a camera inside it")
         xyz = eye + directions * hits.distance[:, None]
         shaded = self._albedo(xyz, hits.part) * self._light_at(xyz, hits.normal)[:, None]
-        image = (255 * np.sqrt(np.minimum(shaded, 1))).astype(np.uint8)  # the square root stands for sRGB's curve
+        image = (255 * np.sqrt(np.minimum(shaded, 1))).astype(np.uint8)  # the square root approximates sRGB's curve
         depth_m = hits.distance.astype(np.float32).reshape(shape)
         return Frame(camera_to_world, depth_m, self._part_owner[hits.part].reshape(shape), image.reshape(*shape, 3))
 
     def _albedo(self, xyz: Points, part: NDArray[np.int64]) -> Points:
-        """Two colors of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
+        """(n, 3) the two colors of each part's material, mixed by two octaves of value noise of its grain."""
         cell = np.floor(xyz * (NOISE_STEPS / self._grain[part])).astype(np.int64) % NOISE_SIDE
         noise = self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]].astype(np.float64)
         share = np.clip(0.5 + noise, 0, 1)[:, None]
         return self._first[part] + (self._second - self._first)[part] * share
 
     def _light_at(self, xyz: Points, normals: Points) -> Points:
-        """Lambert: a ceiling light that casts shadows, fill lights and a little ambient light. (n,)."""
-        start = xyz + 2e-3 * normals  # off the surface, which would else hide the light from itself
+        """(n,) Lambertian: a ceiling light that casts shadows, fill lights and a little ambient light."""
+        start = xyz + 2e-3 * normals  # off the surface, which would otherwise shadow itself
         towards = self._light - start
         distance = np.sqrt(_dot(towards, towards))
         facing = np.maximum(_dot(normals, towards), 0) / distance
@@ -188,6 +188,6 @@ def _dot(first: Points, second: Points) -> Points:
 
 
 def tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
-    """An Open3D tensor; typed loosely, as Open3D's own stubs know no arrays."""
+    """An Open3D tensor; typed loosely, as Open3D's own stubs do not accept arrays."""
     make_tensor: Any = o3d.core.Tensor
     return make_tensor(np.ascontiguousarray(values, dtype))

@@ -18,19 +18,20 @@ from og_pointcloud_room.shapes import Material, box, lathe, rotated, rotation_ab
 
 Points = NDArray[np.float64]
 BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
-"""What a ray hits, where it is no object that stands as it was mapped (a row of CLASS_NAMES)."""
+"""What a ray hits, other than an object that stands as mapped (a row of CLASS_NAMES)."""
 SENSOR_HEIGHT_M, SPEED_M_S = 0.9, 0.4
 FLOOR_STEP_M, RING_STEPS = 0.06, 90
 CLEAR_OF_FURNITURE_M, CLEAR_OF_PATH_M, APART_M = 0.35, 0.6, 0.8
-"""What the middle of a thing that was brought in keeps free around it, where there is so much room."""
+"""Distances that the middle of a thing brought in keeps, where there is room."""
 
 
 @dataclass(frozen=True)
 class Lidar:
-    """A spinning sensor. beams: between the two elevations, in degrees. columns: a turn. hertz: turns a second.
+    """A spinning sensor. beams: between elevations ``lowest`` and ``highest``, degrees. columns: per turn. hertz: turns
+    per second.
 
     noise_m: standard deviation of ranges; dropouts: share of rays without a return; both of a common indoor LiDAR.
-    pose_noise_m, pose_noise_rad: standard deviation of what localisation adds to each pose, per axis.
+    pose_noise_m, pose_noise_rad: standard deviation of the localisation error of each pose, per axis.
     """
 
     beams: int = 32
@@ -53,9 +54,9 @@ class Lidar:
 
 @dataclass(frozen=True)
 class LidarFrame:
-    """xyz: (N, 3) float32 in the sensor's frame, a row a ray, NaN without a return. truth: (N,) int32.
+    """xyz: (N, 3) float32 in the sensor's frame, one row per ray, NaN without a return. truth: (N,) int32.
 
-    stamp: nanoseconds. sensor_to_map: (4, 4), where the robot believes to be. position: (3,), where it is.
+    stamp: nanoseconds. sensor_to_map: (4, 4), the estimated pose. position: (3,), the true position.
     """
 
     stamp: int
@@ -67,7 +68,7 @@ class LidarFrame:
 
 @dataclass(frozen=True)
 class ChangedRoom:
-    """items: what stands there now. truth: (items,) int32, what a ray that hits each is to be called."""
+    """items: what stands there now. truth: (items,) int32, the correct answer for a ray that hits each."""
 
     items: tuple[Item, ...]
     truth: NDArray[np.int32]
@@ -75,7 +76,7 @@ class ChangedRoom:
 
 
 class Drive:
-    """One lap around the middle of the room of that seed. Iterating gives its frames; each seed gives the same ones."""
+    """One lap around the middle of the room of a seed. Iterating gives its frames, the same ones for the same seed."""
 
     def __init__(self, seed: int = 0, lidar: Lidar | None = None, frames: int | None = None) -> None:
         self.lidar, self._seed, self.room = lidar or Lidar(), seed, furnish(seed)
@@ -97,7 +98,7 @@ class Drive:
             noisy = ranges + lidar.noise_m * rng.normal(size=len(ranges))
             noisy[rng.uniform(size=len(ranges)) < lidar.dropouts] = np.nan
             truth = np.where(np.isfinite(noisy), truth, NO_RETURN).astype(np.int32)
-            # Points are in the sensor's frame, so an error of localisation moves all of them together.
+            # Points are in the sensor's frame, so a localisation error moves all of them together.
             believed = pose.copy()
             believed[:3, :3] = rotation_about("z", lidar.pose_noise_rad * rng.normal()) @ pose[:3, :3]
             believed[:3, 3] += lidar.pose_noise_m * rng.normal(size=3)
@@ -120,7 +121,7 @@ class Drive:
 
 
 def _changed(room: Room, path: Points) -> ChangedRoom:
-    """The room today: one chair moved and a suitcase and a ball brought in, where the floor is free."""
+    """The room today: one chair moved, a suitcase and a ball brought in, where the floor is free."""
     chair = next(index for index, item in enumerate(room.objects) if item.name == "chair")
     others = tuple(item for index, item in enumerate(room.objects) if index != chair)
     grey = Material((0.4, 0.4, 0.45), (0.3, 0.3, 0.35), (0.1, 0.1, 0.1))
@@ -143,17 +144,17 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
 
 
 def centered(item: Item) -> Item:
-    """Above the origin."""
+    """The item moved above the origin."""
     x, y, _ = item.middle
     return item.moved((-x, -y, 0.0))
 
 
 def free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> Points:
-    """(2,) the place on the floor nearest to the path that is clear of it, of all furniture and of places taken."""
+    """(2,) the place on the floor nearest to the path that is clear of the path, all furniture and places taken."""
     x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
     floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     from_path, from_taken = (np.linalg.norm(floor[:, None] - places, axis=2).min(axis=1) for places in (path, taken))
-    # Each clearance in parts of what is wanted; where no place has all of it, the freest one is taken.
+    # Each clearance as a share of the wanted one; where no place has them all, the freest one is taken.
     asked = (_clearance(surfaces, floor) / CLEAR_OF_FURNITURE_M, from_path / CLEAR_OF_PATH_M, from_taken / APART_M)
     free = np.min(np.array(asked), axis=0)
     return floor[np.where(free >= min(1.0, free.max()), from_path, np.inf).argmin()]
@@ -167,7 +168,7 @@ def ring(room: Room) -> Points:
     places = around[:, None] * shares[None, :, None]
     clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(RING_STEPS, -1)
     best = shares[clearance.argmax(axis=1)]
-    # Smoothed over 15 steps; the ring is closed, so seven steps of either end are put beyond the other.
+    # Smoothed over 15 steps; as the ring is closed, it is padded with seven steps from the opposite end.
     window = np.hanning(17)[1:-1]
     smooth = np.asarray(np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid"), float)
     return around * smooth[:, None]
@@ -179,6 +180,6 @@ def _on_ring(path: Points, place: float) -> Points:
 
 
 def _clearance(surfaces: Surfaces, places: Points) -> Points:
-    """(n,) meters from each place (n, 2) to the nearest surface between knee and sensor; the floor is one too."""
+    """(n,) meters from each place (n, 2) to the nearest surface between knee and sensor height, or to the floor."""
     at_heights = (np.column_stack([places, np.full(len(places), z)]) for z in (0.4, 0.65, SENSOR_HEIGHT_M))
     return np.min([surfaces.distance_m(xyz) for xyz in at_heights], axis=0).astype(np.float64)

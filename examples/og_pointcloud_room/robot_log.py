@@ -1,4 +1,4 @@
-"""What a drive through the room showed: figures per frame against the truth of every ray, a picture, and a bag."""
+"""The results of a drive through the room: scores per frame against the truth of every ray, a picture, and a bag."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 KEPT_PER_FRAME = 1200
 CEILING_M = 2.3
 SEEN_OFTEN = 0.1
-"""Share of the frames in which a box is seen, to be drawn."""
+"""Share of the frames that a box must be seen in to be drawn."""
 CHANGED_COLOR = (0.85, 0.0, 0.1)
 
 
@@ -29,10 +29,10 @@ CHANGED_COLOR = (0.85, 0.0, 0.1)
 class DriveLog:
     """Per frame: seconds, detections, and shares in [0, 1] (NaN where a frame shows none of the kind).
 
-    accuracy: of rays on things that stand as mapped, those with the right label. unknown: of all returns, those
-    without one. changed_unknown: of rays on what is new or moved, those without a label. background_called: of rays on
-    walls, floor and ceiling, those with one. path: (3,) of each frame. seen: frames in which each
-    instance was detected. sample: of each frame's returns, places in the map, labels, whether too far, and the truth.
+    accuracy: share with the right label among rays on things that stand as mapped. unknown: share without a label among
+    all returns; changed_unknown: among rays on what is new or moved. background_called: share with a label among rays
+    on walls, floor and ceiling. path: (3,) of each frame. seen: number of frames in which each instance was detected.
+    sample: for some of each frame's returns, places in the map, labels, whether too far, and the truth.
     """
 
     seconds: list[float] = field(default_factory=list)
@@ -62,7 +62,7 @@ class DriveLog:
         self.sample.append((result.xyz[kept], labels[kept], too_far, truth[kept]))
 
     def summary(self) -> str:
-        """What the example prints."""
+        """The text that the example prints."""
         median, slowest = 1e3 * np.median(self.seconds), 1e3 * np.max(self.seconds)
         return (
             f"{len(self.seconds)} frames, {median:.1f} ms each in the median ({slowest:.0f} ms the slowest): "
@@ -75,7 +75,7 @@ class DriveLog:
 
 
 def draw_drive(path: Path, log: DriveLog, instances: Instances) -> Path:
-    """The room from above with labels, boxes, path and what does not belong to the map; beside it curves over time."""
+    """The room from above with labels, boxes, path and what is not in the map; beside it, curves over time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, 8), layout="constrained")
@@ -108,7 +108,7 @@ def draw_drive(path: Path, log: DriveLog, instances: Instances) -> Path:
 
 def _draw_map(axes: Axes, log: DriveLog, instances: Instances) -> None:
     xyz, labels, too_far, truth = (np.concatenate(column) for column in zip(*log.sample, strict=True))
-    # Walls and ceiling that the mapping camera never saw are too far as well: what lies on the floor counts here.
+    # Walls and ceiling that the mapping camera never saw are "too far" as well; only what is on the floor is drawn.
     odd = too_far & (truth != BACKGROUND)
     known = labels >= 0
     for chosen, colors, size in ((~known & ~odd, "0.85", 0.5), (known, label_colors(labels[known]) / 255, 0.8)):

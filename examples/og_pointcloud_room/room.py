@@ -73,7 +73,7 @@ def _against_wall(
 def _in_the_middle(
     rng: Random, group: Group, at_walls: list[Group], size: tuple[float, float, float]
 ) -> tuple[Item, ...]:
-    """The group somewhere in the rectangle that the groups at the walls leave free."""
+    """The group placed somewhere in the rectangle that the groups at the walls leave free."""
     up, left, down, right = (wall_group.depth + 2 * WALL_GAP for wall_group in at_walls)
     center = np.array([left - right, down - up]) / 2
     free = np.array([size[0] - left - right, size[1] - up - down])
@@ -82,7 +82,7 @@ def _in_the_middle(
 
 
 def shell(rng: Random, size: tuple[float, float, float]) -> tuple[Item, ...]:
-    """Floor of planks, four walls and the ceiling, all outside of the room's box."""
+    """Plank floor, four walls and the ceiling, all outside the room's box."""
     x, y, z = size
     tone = rng.uniform(0.7, 0.9)
     plank = Material((tone * 0.9, tone * 0.68, tone * 0.45), (tone * 0.68, tone * 0.48, tone * 0.3), (1.2, 0.1, 1.0))

@@ -24,15 +24,15 @@ FRAMES, DAYS_APART_S = 60, 86_400.0
 
 @dataclass(frozen=True)
 class _Day:
-    """room: what stands there. looks: of which objects of both days together, (objects,) int."""
+    """room: what stands there. looks: (objects,) int, each object's number among those of both days."""
 
     room: Room
     looks: np.ndarray
 
 
 class TwoDays:
-    """before, after: frames, a walk each. model: the encoder; its texts are of NAMES. changed: what moved, left and
-    came, by name. places: (3,) middle of each, by "gone", "new", "from" and "to"."""
+    """before, after: the frames of one walk each. model: the encoder; its texts are of NAMES. changed: what moved, left
+    and came, by name. places: (3,) middle of each, by "gone", "new", "from" and "to"."""
 
     feature_space = FEATURE_SPACE
 

@@ -1,7 +1,7 @@
 """Solids of furniture: boxes, turned shapes and cushions as triangle meshes with a two-color grained material.
 
-Lengths in meters, z up. A part stands on the origin of its own frame unless it is given another base. Corners lie on a
-grid of a micrometer, so that the last bit of a sine, which depends on the processor, moves none.
+Lengths in meters, z up. A part stands on the origin of its own frame unless given another base. Corners lie on a
+micrometer grid, so that the last bit of a sine, which depends on the processor, does not move them.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 SEGMENTS = 28
 """Facets around a turned or cushioned shape: round to the eye at two meters."""
 GRID = 2.0**-20
-"""Meters between two places that a corner may have; float32 holds them all within 8 m of the origin."""
+"""Grid spacing of corners in meters; float32 represents the whole grid within 8 m of the origin."""
 
 
 @dataclass(frozen=True)
 class Material:
-    """Two RGB colors in [0, 1] that value noise mixes; grain: size of its blobs along x, y, z in meters."""
+    """Two RGB colors in [0, 1], mixed by value noise; grain: size of its blobs along x, y, z in meters."""
 
     color: tuple[float, float, float]
     second: tuple[float, float, float]
@@ -29,7 +29,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Part:
-    """One closed solid. vertices: (V, 3) float64 meters, put on the grid; triangles: (T, 3) int32, of any winding."""
+    """One closed solid. vertices: (V, 3) float64 meters, rounded to the grid; triangles: (T, 3) int32, any winding."""
 
     vertices: NDArray[np.float64]
     triangles: NDArray[np.int32]
@@ -48,7 +48,7 @@ class Part:
 
 
 def rotated(xyz: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 3) points turned by ``rotation`` (3, 3), summed in one order everywhere, as a matrix product is not."""
+    """(n, 3) points turned by ``rotation`` (3, 3), summed in the same order everywhere, unlike a matrix product."""
     x, y, z = rotation.T
     return xyz[:, :1] * x + xyz[:, 1:2] * y + xyz[:, 2:] * z
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Time what runs inside into ``seconds`` and print it when it is done."""
+    """Time the block into ``seconds`` and print it when done."""
     start = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - start

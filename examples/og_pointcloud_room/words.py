@@ -1,4 +1,4 @@
-"""What people call the room's things: names for each class, and words too close to them to be right or wrong."""
+"""What people call the room's things: names for each class, and words too similar to count as right or wrong."""
 
 from __future__ import annotations
 
@@ -38,4 +38,4 @@ watering can, high chair, car seat, crib, perfume bottle, pill bottle, soap disp
 yoga mat, placemat, mouse pad, map, lamp post, street light, cooking pot, grass, postcard, letter, soil,
 projector screen, plate, tray, cutting board, clipboard, log, wooden post, measuring cup, milk carton, olive oil,
 trophy, statue, vinegar, ketchup, tin can, soda can, pillowcase, sidewalk, road, ceiling""")
-"""Everyday words that a thing of the room might well be called: neither wanted nor counted as mistakes."""
+"""Everyday words that might well name a thing of the room: neither wanted nor counted as mistakes."""

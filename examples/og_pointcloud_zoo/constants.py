@@ -1,8 +1,8 @@
-"""Every number of the default way on one page: where it is from, and what the zoo says of half and of twice its value.
+"""Every number of the default method on one page: its source, and the zoo's error at half and at twice its value.
 
-A number between 0 and 1 is not doubled beyond 1 but moved half of the way there. Each value is tried on a few scenes
-of the half for choosing; the mask table is made anew only where the number changes it. Results are kept beside the
-scenes by a checksum of the code, so that an interrupted run goes on.
+A number between 0 and 1 is not doubled beyond 1 but moved halfway to 1. Each value is tried on a few scenes of the
+choosing half; the mask table is rebuilt only where the number changes it. Results are kept beside the scenes by a
+checksum of the code, so that an interrupted run can continue.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from og_pointcloud_zoo.measure import answered
 SCENES = (
     "room-0", "room-noisy-0", "room-sparse-0", "detector-0", "shelf-0", "bin-0", "board-0", "plants-0", "glass-0",
 )  # fmt: skip
-"""Of the half for choosing: clean and noisy, dense and sparse, all masked and things only, few views and many."""
+"""From the choosing half: clean and noisy, dense and sparse, all masked and things only, few views and many."""
 SWEPT = ("geometry", "grouping", "membership")
-"""Records of settings whose numbers all steer labels."""
+"""Settings records whose numbers all affect labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.view_reports.HIDDEN_REPORT_PROBABILITY": ("", ("_add_log_likelihood",)),
@@ -64,9 +64,9 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.smoothing.NOISE_BIAS": ("table", ("_smoothed",)),
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
-"""Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
+"""Constants of modules: whether they change the mask table, and the compiled functions that use them."""
 TABLE = ("geometry", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes")
-"""What the mask table depends on."""
+"""Settings that the mask table depends on."""
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
     "derived": (
@@ -94,16 +94,17 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "rendering.sightings.RING_SHARE", "rendering.smoothing.NOISE_NEIGHBORS", "rendering.smoothing.NOISE_BIAS",
     ),
 }  # fmt: skip
-"""Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
+"""Where numbers come from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
 SHARP, BETTER, FLAT = 0.02, 0.005, 0.002
-"""Of the mean error: a number that adds the first is sharp; one that moves it by less than the last does not matter to
-these scenes. Another sample of points to choose their size by, no better or worse, takes off nearly the second."""
+"""Changes of the mean error: a number that adds the first is sharp; one that lowers it by more than the second is
+better elsewhere; one that moves it by less than the last does not matter here. Choosing the point size on another
+sample of points, no better or worse, lowers it by nearly the second."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """path: of the setting, or of the module's name within og_pointcloud. value: as it stands. meaning: what its
-    documentation says. source: of SOURCES."""
+    """path: of the setting, or of the module's constant within og_pointcloud. value: the current one. meaning: its
+    documentation. source: one of SOURCES."""
 
     path: str
     value: Any
@@ -112,7 +113,7 @@ class Constant:
 
     @property
     def of_module(self) -> bool:
-        """Whether it stands in a module rather than in the settings."""
+        """Whether it is a constant of a module rather than a setting."""
         return self.path.split(".")[-1].isupper()
 
     @property
@@ -128,7 +129,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Tried:
-    """Error, 1 - mIoU, of each of SCENES: as it stands, at half and at twice the value."""
+    """Error, 1 - mIoU, of each of SCENES: at the current value, at half and at twice of it."""
 
     constant: Constant
     default: tuple[float, ...]
@@ -136,12 +137,12 @@ class Tried:
     twice: tuple[float, ...]
 
     def change(self, errors: tuple[float, ...]) -> float:
-        """Of the mean error."""
+        """Change of the mean error."""
         return float(np.mean(errors) - np.mean(self.default))
 
     @property
     def verdict(self) -> str:
-        """Whether it is sharp, does not matter, or would be better otherwise."""
+        """Whether it is sharp, does not matter, or would be better at another value."""
         changes = self.change(self.half), self.change(self.twice)
         if max(map(abs, changes)) < FLAT:
             return "does not matter here"
@@ -151,7 +152,7 @@ class Tried:
 
 
 def constants() -> list[Constant]:
-    """All of the default way, with what the code says of them; a source of "not said" where SOURCES lacks one."""
+    """All of the default method, with their documentation; the source is "not said" where SOURCES has none."""
     default, meanings = FitSettings(), _meanings(inspect.getsource(records))
     found = []
     for owner in SWEPT:
@@ -170,7 +171,7 @@ def _constant(path: str, value: Any, meaning: str) -> Constant:
 
 
 def _meanings(source: str) -> dict[tuple[str, str], str]:
-    """(class or "", name) -> the string below it; of a name without one, a string that speaks of it."""
+    """(class or "", name) -> the string below it; for a name without one, a string that mentions it."""
     found: dict[tuple[str, str], str] = {}
     tree = ast.parse(source)
     classes = [(node.name, node.body) for node in tree.body if isinstance(node, ast.ClassDef)]
@@ -184,7 +185,7 @@ def _meanings(source: str) -> dict[tuple[str, str], str]:
 
 
 def _text(node: ast.stmt) -> str | None:
-    """The string that a statement is; None where it is another."""
+    """The string of a bare string statement; None for any other."""
     value = node.value if isinstance(node, ast.Expr) else None
     return str(value.value) if isinstance(value, ast.Constant) else None
 
@@ -202,7 +203,7 @@ def _twice(value: Any) -> Any:
 
 
 def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
-    """The errors of each constant, scenes and results under ``output``; what is known is not measured again."""
+    """The errors of each constant, scenes and results under ``output``; known results are not measured again."""
     folders = [made_scene(draw(name), output / "scenes") for name in SCENES]
     kept = output / f"constants-{_checksum():08x}"
     bench = _Bench(folders)
@@ -218,7 +219,7 @@ def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
 
 
 def _checksum() -> int:
-    """Of all code that labels."""
+    """Checksum of the code that labels."""
     root, total = Path(og_pointcloud.__file__).parent, 0
     for path in sorted(path for folder in ("fitting", "rendering", "ask") for path in (root / folder).glob("*.py")):
         total = zlib.crc32(path.read_bytes(), total)
@@ -226,7 +227,7 @@ def _checksum() -> int:
 
 
 class _Bench:
-    """Scenes with their mask tables as they stand."""
+    """Scenes with their mask tables at the current values."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         self.folders, self._prepared = folders, {}
@@ -254,7 +255,7 @@ def _module(path: str) -> tuple[Any, str]:
 
 @contextmanager
 def _in_module(path: str, value: Any) -> Iterator[None]:
-    """A module's number changed for a while; compiled functions that know it are compiled anew, on no disk."""
+    """Changes a module's number temporarily; compiled functions that use it are recompiled, without a disk cache."""
     module, name = _module(path)
     before, samples = getattr(module, name), getattr(module, "VOTE_SAMPLES", None)
     try:
@@ -269,10 +270,10 @@ def _in_module(path: str, value: Any) -> Iterator[None]:
 def _put(module: Any, name: str, value: Any, path: str) -> None:
     from numba.core.caching import NullCache
 
-    # numba freezes a module's numbers into compiled code, and would load that from the disk.
+    # numba freezes a module's numbers into compiled code, which it would load from the disk cache.
     changes = getattr(module, name) != value
     setattr(module, name, value)
-    if path.startswith("rendering.sightings."):  # where votes are taken follows from two of its numbers
+    if path.startswith("rendering.sightings."):  # where votes are sampled depends on two of its numbers
         share, edge = module.RING_SHARE, module.EDGE_PX
         ring = [(edge * np.cos(angle), edge * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
         module.VOTE_SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
@@ -283,7 +284,7 @@ def _put(module: Any, name: str, value: Any, path: str) -> None:
 
 
 def page(results: Sequence[Tried]) -> str:
-    """Markdown: the table, and what it says; numbers that were not tried are at its end."""
+    """Markdown: the table and its summary; numbers that were not tried come last."""
     default = np.mean(results[0].default) if results else float("nan")
     sharp = [result.constant.path for result in results if result.verdict.startswith("sharp")]
     flat = [result.constant.path for result in results if result.verdict == "does not matter here"]

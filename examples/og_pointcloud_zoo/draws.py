@@ -1,8 +1,8 @@
-"""What is drawn for each scene of the zoo: one record of numbers. The same name is the same scene on every machine.
+"""The random parameters of each scene of the zoo. The same name gives the same scene on every machine.
 
-A kind fixes what it is about and leaves the rest to chance. Each has two scenes: number 0 is for choosing, number 1 for
-judging alone. Of scenes given by path the last digit of the name decides: even for choosing, odd or none for judging;
-captures on which today's numbers were settled are for choosing.
+A kind fixes the parameters it is about and leaves the rest to chance. Each has two scenes: number 0 is for choosing,
+number 1 for judging only. For scenes given by path the last digit of the name decides: even for choosing, odd or none
+for judging; captures on which today's numbers were chosen are for choosing.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ SETTLED = ("seven_redkitchen", "apc_shelf_B", "ycb_0050", "nuscenes_frame")
 class Draw:
     """One scene. place: of `places.PLACES`, "street", or "demo", the demo's own capture with its fused cloud.
 
-    points: of the cloud. views, width, height: of the images, pixels. noise: of points across their surface, standard
-    deviation in spacings. uneven: density at the walls is exp(-uneven) of that in the middle. backdrop: density of
-    floor, walls and ceiling as a part of that of things. outliers: share of points anywhere; floaters: share of points
-    between a camera and what it sees. hidden: share of what no view sees that is in the cloud all the same.
-    all_masked: floor, walls and ceiling have masks and classes too; else they are known background.
-    split, merge, miss, spurious, wrong_class, edge_px: how the proposer errs (`MaskNoise`). spans: so many things share
-    their mask with a neighbor in all views. taken: so many things are gone in the second half of the views. levels:
-    each view comes three times, with masks of parts, of things, and of things with what stands on them. confused: mean
-    share of a thing's masks that are named as something alike (`places.ALIKE`); of each thing from none to twice that.
-    blurred: share of views whose masks are ragged and often missing, as of a camera that moves.
-    swallow: chance that what has no mask lies in that of what it stands on or before.
+    points: of the cloud. views: number of images; width, height: of an image, pixels. noise: of points across their
+    surface, standard deviation in spacings. uneven: density at the walls is exp(-uneven) times that in the middle.
+    backdrop: density of floor, walls and ceiling relative to that of things. outliers: share of points placed anywhere;
+    floaters: share of points between a camera and what it sees. hidden: share of the surfaces seen by no view that is
+    in the cloud all the same. all_masked: floor, walls and ceiling have masks and classes too; else they are known
+    background. split, merge, miss, spurious, wrong_class, edge_px: how the proposer errs (`MaskNoise`). spans: number
+    of things that share their mask with a neighbor in all views. taken: number of things gone in the second half of the
+    views. levels: each view comes three times, with masks of parts, of things, and of things with what stands on them.
+    confused: mean share of a thing's masks that are named as something alike (`places.ALIKE`); for a single thing from
+    none to twice that. blurred: share of views whose masks are ragged and often missing, as from a moving camera.
+    swallow: probability that something without a mask lies in the mask of what it stands on or before.
     """
 
     name: str
@@ -69,7 +69,7 @@ SFM: Fixed = {"points": (8_000, 20_000), "noise": (0.1, 0.4), "backdrop": (0.002
               "hidden": (0, 0)}  # fmt: skip
 
 MEASURED: Fixed = {"all_masked": True, "noise": (0, 0), "uneven": (0, 0), "hidden": (1, 1), "merge": (0.0, 0.03)}
-"""Of places outdoors: their sensors bring noise and uneven density themselves, and see what no camera does."""
+"""For places outdoors: their sensors bring noise and uneven density themselves, and see what no camera does."""
 
 KINDS: Mapping[str, Fixed] = {
     "room": {"place": "room", "all_masked": False},
@@ -147,29 +147,29 @@ KINDS: Mapping[str, Fixed] = {
     },
     "demo": {"place": "demo", "views": (30, 40), "width": (320, 480)},
 }
-"""Name -> what is fixed of it: one value, or the range that it is drawn from."""
+"""Name -> the parameters it fixes: one value, or the range that it is drawn from."""
 ANY: Fixed = {
     "points": (10_000, 80_000), "views": (16, 44), "width": (240, 640), "noise": (0.0, 1.0), "uneven": (0.0, 1.2),
     "backdrop": (0.3, 1.0), "outliers": (0.0, 0.002), "floaters": (0.0, 0.002), "hidden": (0.0, 0.5),
     "split": (0.05, 0.25), "merge": (0.0, 0.08), "miss": (0.05, 0.2), "spurious": (0.0, 0.1),
     "wrong_class": (0.02, 0.1), "edge_px": (0.3, 1.2),
 }  # fmt: skip
-"""The ranges of what a kind leaves to chance. Whole numbers are drawn evenly over their logarithm."""
+"""The ranges of parameters that a kind leaves to chance. Whole numbers are drawn log-uniformly."""
 
 
 def scene_names() -> list[str]:
-    """All that can be drawn, the two scenes of a kind side by side."""
+    """The names of all scenes, the two of a kind side by side."""
     return [f"{kind}-{number}" for kind in KINDS for number in (0, 1)]
 
 
 def draw(name: str) -> Draw:
-    """The scene of a name of `scene_names`; KeyError for another."""
+    """The scene with a name of `scene_names`; KeyError for any other."""
     kind, number = name[:-2], name[-2:]
     if kind not in KINDS or number not in ("-0", "-1"):
         raise KeyError(name)
     seed = zlib.crc32(name.encode()) % 10_000
     rng = np.random.default_rng([seed, 99])
-    # Each number has its own draw, also where the kind fixes it: fixing one more leaves the others as they were.
+    # Each number has its own draw, even where the kind fixes it: fixing another one leaves the rest unchanged.
     fixed = KINDS[kind]
     numbers: dict[str, Any] = {"all_masked": bool(rng.uniform() < 0.35)}
     for key, usual in ANY.items():
@@ -183,7 +183,7 @@ def draw(name: str) -> Draw:
 
 
 def _between(limits: tuple[float, float], share: float) -> float:
-    """The value at a share of the way; whole numbers by their logarithm."""
+    """The value at this share of the range; whole numbers on a logarithmic scale."""
     low, high = limits
     if isinstance(low, int) and low > 0:
         return round(low * (high / low) ** share)
@@ -191,12 +191,12 @@ def _between(limits: tuple[float, float], share: float) -> float:
 
 
 def half_of(name: str) -> str:
-    """ "choose" or "judge": which half a scene is of, by its name alone."""
+    """ "choose" or "judge": which half a scene is in, by its name alone."""
     digits = re.findall(r"\d", name)
     even = bool(digits) and int(digits[-1]) % 2 == 0
     return "choose" if even or name in SETTLED else "judge"
 
 
 def is_chosen(name: str, half: str | None, beginnings: Sequence[str]) -> bool:
-    """Whether a scene is of a half, None for both, and its name begins in one of these ways; without any, in any."""
+    """Whether a scene is in a half (None: either), and its name begins with one of ``beginnings``, if there are any."""
     return half in (None, half_of(name)) and name.startswith(tuple(beginnings) or "")

@@ -1,7 +1,7 @@
-"""A drawn scene -> a capture folder with exact truth, in the formats that any capture has.
+"""A drawn scene -> a capture folder with exact truth, in the usual capture formats.
 
 Clouds are sampled on the surfaces themselves, so that density, noise, outliers and floaters are as drawn; masks and
-features are made as the demo's are. Points carried by noise to where another surface is nearer have no truth.
+features are made as for the demo. Points that noise moved to where another surface is nearer have no truth.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from og_pointcloud_zoo.places import ALIKE, GLASS, MIRROR, PLACES, Sensor
 TESTS = str(Path(__file__).parents[2] / "tests")
 SHELL = ("floor", "wall", "ceiling")
 GHOSTS = 0.05
-"""Share of points that a depth sensor sees in a mirror."""
+"""Share of points that a depth sensor measures in a mirror."""
 CLOUD, TEXTURE, PATH, MASKS, FEATURES, WORDS = range(6)
-"""Streams of random numbers of a scene."""
+"""Random number streams of a scene."""
 SMALL = ("mug", "book", "bottle", "vase", "cushion", "potted plant", "lamp", "monitor", "picture")
 Doubles = NDArray[np.float64]
 Owners = NDArray[np.int32]
 
 
 def made_scene(draw: Draw, cache: Path) -> Path:
-    """The folder of a scene, made where it is not there yet; whole or not at all."""
+    """The folder of a scene, made if it is missing; complete or not at all."""
     folder = cache / draw.name
     if not folder.is_dir():
         cache.mkdir(parents=True, exist_ok=True)
@@ -81,7 +81,7 @@ def _place(draw: Draw) -> RoomCapture:
     if draw.all_masked:
         room = Room(room.size, (*room.objects, *room.shell), ())
     intrinsics = Intrinsics(draw.width, draw.height, 0.82 * draw.width)
-    # A depth sensor looks through glass: the cloud is of the room without it, photographs may show it.
+    # A depth sensor looks through glass: the cloud shows the room without it, photographs may show it.
     sensed = _without(room, [k for k, item in enumerate(room.objects) if item.name == GLASS])
     caster = RayCaster(sensed, _stream(draw, TEXTURE))
     poses = place.poses(draw.views, caster.surfaces, _stream(draw, PATH))
@@ -112,7 +112,7 @@ def _place(draw: Draw) -> RoomCapture:
 
 
 def _named(draw: Draw, class_of: Owners, names: tuple[str, ...], views: int) -> Owners:
-    """(views, objects) class that an encoder takes each object for: its own, or one alike."""
+    """(views, objects) the class that an encoder takes each object for: its own, or one alike."""
     found = np.repeat(class_of[None], views, axis=0)
     if draw.confused:
         rng = _stream(draw, FEATURES, 0, 0)
@@ -125,13 +125,13 @@ def _named(draw: Draw, class_of: Owners, names: tuple[str, ...], views: int) -> 
 
 
 def _without(room: Room, gone: list[int]) -> Room:
-    """The room with some objects far below its floor, where no camera sees them; all keep their numbers."""
+    """The room with some objects moved far below its floor, where no camera sees them; all keep their numbers."""
     objects = [item.moved((0, 0, -100)) if k in gone else item for k, item in enumerate(room.objects)]
     return replace(room, objects=tuple(objects))
 
 
 def _shown(draw: Draw, room: Room, sensed: Room, intrinsics: Intrinsics, frames: list[Frame]) -> list[Frame]:
-    """What photographs show, where that is not what the depth sensor finds: panes, and things taken away."""
+    """The frames with what photographs show differently from the depth sensor: panes, and things taken away."""
     rng, shown = _stream(draw, TEXTURE, 1), list(frames)
     if sensed is not room and any(item.name == GLASS for item in room.objects):
         pane = RayCaster(room, _stream(draw, TEXTURE))
@@ -152,8 +152,8 @@ def _shown(draw: Draw, room: Room, sensed: Room, intrinsics: Intrinsics, frames:
 def _masked(
     draw: Draw, room: Room, frames: list[Frame], intrinsics: Intrinsics
 ) -> list[tuple[Frame, NDArray[np.uint16]]]:
-    """Frames with their masks; with levels each frame three times."""
-    # Which object's mask each pixel is in: things alone; with levels also parts, and things with what stands on them.
+    """Frames with their masks; with levels, each frame three times."""
+    # The object whose mask each pixel is in: things alone; with levels also parts, and things with what stands on them.
     noise = MaskNoise(
         draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px, swallow=draw.swallow
     )
@@ -175,13 +175,13 @@ def _masked(
 
 
 def _blurred(noise: MaskNoise) -> MaskNoise:
-    """Of a view taken in motion: edges wander four times as far, and more are missing or joined."""
+    """The mask noise of a view taken in motion: edges wander four times as far, more masks are missing or joined."""
     return replace(noise, edge_px=4 * noise.edge_px, miss=noise.miss + 0.25, merge=noise.merge + 0.1)
 
 
 def _together(room: Room, spans: int) -> Owners:
-    """(objects + 1,) the object whose mask each object is in: of the first ``spans`` small things the one beside them,
-    of the others their own. The last entry is of what has no mask."""
+    """(objects + 1,) the object whose mask each object is in: for the first ``spans`` small things the one beside them,
+    for the others their own. The last entry stands for pixels without a mask."""
     owner = np.append(np.arange(len(room.objects)), -1).astype(np.int32)
     middle = np.array([item.vertices.mean(axis=0) for item in room.objects])
     large = [k for k, item in enumerate(room.objects) if item.name not in (*SMALL, *SHELL)]
@@ -197,12 +197,12 @@ def _cloud(
     draw: Draw, sensor: Sensor, room: Room, surfaces: Surfaces, frames: list[Frame], intrinsics: Intrinsics,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], Owners, Owners]:  # fmt: skip
-    """xyz (n, 3), rgb (n, 3) uint8, the object that each point was sampled on, and how many frames see that place."""
+    """xyz (n, 3), rgb (n, 3) uint8, the object that each point was sampled on, and how many frames see it there."""
     mirrors = np.flatnonzero([item.name == MIRROR for item in room.objects])
     shares = {"outliers": draw.outliers, "floaters": draw.floaters, "ghosts": GHOSTS if len(mirrors) else 0}
     extra = {name: int(share * draw.points) for name, share in shares.items()}
-    # Samples are drawn in batches until enough are left: in the room, thinned towards its walls, and seen or by chance
-    # kept hidden.
+    # Samples are drawn in batches until enough are kept: those in the room, thinned towards its walls, and seen by a
+    # view or, by chance, kept though hidden.
     wanted, kept = draw.points - sum(extra.values()), []
     for _ in range(200):
         xyz, normal, owner, rgb, offset = sensor(max(draw.points, 10_000), rng)
@@ -218,7 +218,7 @@ def _cloud(
         if sum(len(part[0]) for part in kept) >= wanted:
             break
     xyz, normal, owner, rgb, offset, views = (np.concatenate(column)[:wanted] for column in zip(*kept, strict=True))
-    # Noise counts in spacings of the things' points, as a fit's settings do: the mean distance to the three nearest.
+    # Noise is in spacings of the things' points, as in a fit's settings: the mean distance to the three nearest.
     things = xyz[owner >= 0] if (owner >= 0).any() else xyz
     to_others: Doubles = np.asarray(cKDTree(things).query(things[:20_000], 4)[0])[:, 1:]
     spacing = float(np.median(to_others.mean(axis=1)))
@@ -236,7 +236,7 @@ def _cloud(
 
 
 class _Sampler:
-    """Random points of a room's surfaces, evenly but for ``backdrop``; none on mirrors."""
+    """Random points on a room's surfaces, uniform except for ``backdrop``; none on mirrors."""
 
     def __init__(self, room: Room, backdrop: float) -> None:
         corners, owner, color, weight = [], [], [], []
@@ -256,9 +256,9 @@ class _Sampler:
         self.reach = np.cumsum(length * weights)
 
     def __call__(self, count: int, rng: np.random.Generator) -> Raw:
-        """So many, where they are."""
+        """``count`` points, without noise."""
         triangle = np.minimum(np.searchsorted(self.reach, rng.random(count) * self.reach[-1]), len(self.reach) - 1)
-        a, b = np.sqrt(rng.random(count)), rng.random(count)  # even over a triangle: a is the way from its first corner
+        a, b = np.sqrt(rng.random(count)), rng.random(count)  # uniform over a triangle: a runs from its first corner
         first, second, third = self.corners[triangle].transpose(1, 0, 2)
         xyz = (1 - a)[:, None] * first + (a * (1 - b))[:, None] * second + (a * b)[:, None] * third
         blend = rng.random((count, 1))
@@ -270,9 +270,9 @@ class _Sampler:
 def _views(
     xyz: Doubles | NDArray[np.float32], frames: list[Frame], intrinsics: Intrinsics, surfaces: Surfaces | None = None
 ) -> Owners:
-    """(n,) how many frames see each point: it is in the image, and no surface is before it; or, without surfaces, it
-    is no deeper than what its pixel shows."""
-    # Sums written out, not matrix products, whose last bit depends on the processor.
+    """(n,) how many frames see each point: it is in the image, and no surface is in front of it; or, without surfaces,
+    it is no deeper than what its pixel shows."""
+    # Sums are written out, as the last bit of matrix products depends on the processor.
     count, half = np.zeros(len(xyz), np.int32), np.array([intrinsics.width / 2, intrinsics.height / 2])
     points = np.asarray(xyz, np.float64)
     for frame in frames:
@@ -291,7 +291,7 @@ def _views(
             count[inside] += depth[inside] < 1.02 * frame.depth_m[row[inside], column[inside]] + 0.01
         else:
             steps = shifted[inside]
-            # The ray ends 2 mm before the point, or its own surface would hide it.
+            # The ray ends 2 mm before the point, as its own surface would hide it.
             clear = 1 - 2e-3 / np.sqrt((steps**2).sum(axis=1))
             start = np.broadcast_to(pose[:3, 3], steps.shape)
             count[inside] += ~surfaces.is_blocked(start, steps * clear[:, None])
@@ -299,13 +299,13 @@ def _views(
 
 
 def _floaters(frames: list[Frame], intrinsics: Intrinsics, count: int, rng: np.random.Generator) -> Doubles:
-    """(count, 3) between cameras and what they see."""
+    """(count, 3) points between cameras and what they see."""
     places = rng.random((count, 3))
     return _at_depths(frames, intrinsics, places[:, :2], 0.15 + 0.7 * places[:, 2])
 
 
 def _at_depths(frames: list[Frame], intrinsics: Intrinsics, places: Doubles, share: Doubles) -> Doubles:
-    """(n, 3) points at a share of the depth of random pixels. places: (n, 2) in [0, 1), of the frame and its pixel."""
+    """(n, 3) points at a share of the depth of pixels. places: (n, 2) in [0, 1), choosing the frame and its pixel."""
     view = (places[:, 0] * len(frames)).astype(int)
     pixel = (places[:, 1] * intrinsics.width * intrinsics.height).astype(int)
     directions = intrinsics.directions().reshape(-1, 3)
@@ -321,7 +321,7 @@ def _ghosts(
     room: Room, frames: list[Frame], intrinsics: Intrinsics, mirrors: NDArray[np.int64], count: int,
     rng: np.random.Generator,
 ) -> Doubles:  # fmt: skip
-    """(count or fewer, 3) points behind a mirror that faces -y, where a depth sensor finds what it reflects."""
+    """(count or fewer, 3) points behind a mirror that faces -y, where a depth sensor puts what it reflects."""
     if not count:
         return np.zeros((0, 3))
     surfaces = Surfaces([*room.objects, *room.shell])
@@ -332,7 +332,7 @@ def _ghosts(
         pose = frame.camera_to_world
         ray = (pose[:3, :3] * directions[at][:, None]).sum(axis=2)
         touch = pose[:3, 3] + frame.depth_m.ravel()[at][:, None] * ray
-        # The reflected ray says how far; the sensor puts the point straight on, behind the mirror.
+        # The reflected ray gives the distance; the sensor puts the point straight ahead, behind the mirror.
         back = ray * (1, -1, 1)
         for start, turned, straight in zip(touch, back, ray, strict=True):
             far = surfaces.cast(start + 1e-3 * turned, turned[None]).distance[0]
@@ -344,7 +344,7 @@ def _ghosts(
 
 
 def _street(draw: Draw) -> RoomCapture:
-    """The street of the tests, seen from a car; its road and pavement are known background."""
+    """The tests' street, seen from a car; its road and pavement are known background."""
     if TESTS not in sys.path:
         sys.path.append(TESTS)
     from street import CLASSES, FARTHEST_M, Street, make_street  # pyright: ignore[reportMissingImports]
@@ -359,7 +359,7 @@ def _street(draw: Draw) -> RoomCapture:
         frames.append(Frame(pose, np.minimum(depth, FARTHEST_M), owner.astype(np.int32), street.image(view.camera)))
     points, owner = made.scene.points, made.owner.astype(np.int32)
     views = _views(points.xyz, frames, intrinsics)
-    # The street's own texts are the first that its generator draws after the things and the points.
+    # The street's own texts are the first thing that its generator draws after the things and the points.
     rng = np.random.default_rng(draw.seed)
     Street.build(length, rng).points(draw.points, rng)
     model = FeatureModel(len(CLASSES), rng)

@@ -1,4 +1,4 @@
-"""One scene of the zoo, fitted and scored as any capture is: our labels, what the fit says of itself, and baselines."""
+"""One scene of the zoo, fitted and scored like any capture: our labels, the fit's own reliability, and baselines."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ WORDS, BANK = "text_features.npz", "word_bank.npz"
 
 @dataclass(frozen=True)
 class Row:
-    """One scene. miou, background, unknown: as `Score` has them. seconds: of the fit, capture in memory;
-    core_seconds: of all cores together, which other work on the machine changes less. worse: how the scene was made
-    worse before, as "views=5".
+    """One scene. miou, background, unknown: as in `Score`. seconds: of the fit, capture in memory; core_seconds: summed
+    over all cores, which other work on the machine affects less. worse: how the scene was made worse before the fit, as
+    "views=5".
 
-    reliability: what the fit says of itself, in [0, 1]. baseline: the best one, None where none was asked for; gain:
-    our mIoU less its, over the same blocks of space, and the middle 95 % of that.
+    reliability: the fit's own, in [0, 1]. baseline: the best one, None if none was measured; gain: our mIoU less the
+    baseline's, over the same blocks of space, with its 95 % interval.
     """
 
     scene: str
@@ -64,10 +64,10 @@ class Row:
 def measure(
     folder: Path, settings: FitSettings | None = None, baselines: bool = True, changes: Mapping[str, Any] | None = None
 ) -> Row:
-    """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table.
+    """Fit and score a capture with gt.npz and text_features.npz, and the baselines on the same mask table.
 
-    changes: kind -> amount by which the capture is made worse before (`worse`). It is scored at its own points: those
-    that were left out are labelled as the nearest that was not.
+    changes: kind -> amount by which the capture is made worse before the fit (`worse`). It is scored at all its points:
+    those that were left out take the label of the nearest one that was not.
     """
     capture, truth = read_capture(folder), read_truth(folder)
     scene = capture
@@ -99,13 +99,13 @@ def measure(
 
 
 def _place_of_points(capture: Scene, scene: Scene) -> NDArray[np.integer]:
-    """(n,) the point of a worse scene whose label each of the capture's points has."""
+    """(n,) the point of the worse scene that each point of the capture takes its label from."""
     xyz, left = capture.points.xyz, scene.points.xyz
     return np.arange(len(xyz)) if len(left) >= len(xyz) else np.asarray(cKDTree(left).query(xyz)[1])
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
-    """What a fitted cloud says of each of its points, with the capture's own word bank where it has one."""
+    """A fitted cloud's label of each of its points, with the capture's own word bank if it has one."""
     if (folder / BANK).is_file():
         with np.load(folder / BANK) as bank:
             cloud = replace(cloud, word_bank=og.WordBank(bank["vectors"]))
@@ -140,7 +140,7 @@ def parsed_settings(changes: Iterable[str]) -> FitSettings:
 
 
 def parsed(changes: Iterable[str]) -> dict[str, Any]:
-    """Values by name of ``name=value``: numbers where they are some, else text."""
+    """Values by name from ``name=value``: numbers where possible, else text."""
     found: dict[str, Any] = {}
     for change in changes:
         name, _, value = change.partition("=")

@@ -1,7 +1,7 @@
-"""A street and rough country under a sky, and the two sensors that such places are measured with.
+"""A street and rough country under a sky, and the two sensors that measure such places.
 
-Meters, z up. All that there is has a name, the ground and the sky too: outdoors proposers mask everything. What a
-`Scanner` or `Matched` gives is a cloud's raw points; `make.py` counts who sees them.
+Meters, z up. Everything has a name, the ground and the sky too, as proposers mask everything outdoors. A `Scanner` or
+`Matched` gives the raw points of a cloud; `make.py` counts the views that see them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SKY = "sky"
 STREET = ("road", "sidewalk", "building", "car", "pole", "tree", "person", "fence", SKY)
 COUNTRY = ("trail", "grass", "bush", "tree", "rock", "log", "pole", SKY)
 HALF_LENGTH_M, CLEAR_M = 36.0, 30.0
-"""Half of a street's or a field's length; half of the way that things stand along."""
+"""Half the length of a street or field; half the length of the stretch with things along it."""
 LEAVES = Material((0.24, 0.46, 0.16), (0.12, 0.28, 0.1), (0.3, 0.3, 0.3))
 BARK = Material((0.36, 0.27, 0.2), (0.25, 0.18, 0.12), (0.2, 0.2, 0.2))
 STONE = Material((0.55, 0.53, 0.5), (0.4, 0.39, 0.37), (0.3, 0.3, 0.3))
@@ -36,8 +36,8 @@ Doubles = NDArray[np.float64]
 
 
 class Raw(NamedTuple):
-    """Measured points. xyz: (n, 3) where a ray first meets a surface. normal: (n, 3) of it. owner: (n,) object. rgb:
-    (n, 3) uint8. offset: (n, 3) meters from there to where the sensor puts the point."""
+    """Measured points. xyz: (n, 3) where a ray first meets a surface. normal: (n, 3) of that surface. owner: (n,)
+    object. rgb: (n, 3) uint8. offset: (n, 3) meters from xyz to where the sensor puts the point."""
 
     xyz: Doubles
     normal: Doubles
@@ -50,7 +50,7 @@ class Raw(NamedTuple):
 
 
 def _under_sky(items: Sequence[Item], half_width_m: float, height_m: float) -> Room:
-    """Items in a box of sky, which is their last."""
+    """Items in a box of sky, which is the last item."""
     x, y = 2 * HALF_LENGTH_M, 2 * half_width_m
     walls = [box((x, 0.1, height_m), (0, side * (y / 2 + 0.05), 0), AIR) for side in (-1, 1)]
     walls += [box((0.1, y, height_m), (side * (x / 2 + 0.05), 0, 0), AIR) for side in (-1, 1)]
@@ -92,7 +92,7 @@ def _log(rng: Random) -> Item:
 
 
 def _pole(rng: Random) -> Item:
-    """5 to 6 m of a lamp or 2.3 m of a sign with its plate."""
+    """A street lamp of 5 to 6 m, or a sign of 2.3 m with its plate."""
     if rng.uniform() < 0.5:
         tall = rng.uniform(5, 6)
         return Item("pole", (box((0.12, 0.12, tall), (0, 0, 0), STEEL), box((0.9, 0.15, 0.1), (0.4, 0, tall), STEEL)))
@@ -146,7 +146,7 @@ def street_room(rng: Random) -> Room:
 
 
 def _waves(rng: Random, low: float, high: float, cells: int, size: int) -> Doubles:
-    """(size, size) smooth heights from low to high, of so many hills along a side."""
+    """(size, size) smooth heights from low to high, with ``cells`` hills along a side."""
     field = zoom(rng.uniform(0, 1, (cells, cells)), size / cells, order=3, mode="nearest", grid_mode=True)
     return low + (high - low) * np.clip(field, 0, 1)
 
@@ -193,12 +193,12 @@ def country_room(rng: Random) -> Room:
 
 @dataclass(frozen=True)
 class Scanner:
-    """A spinning scanner: rays from each of ``origins`` (s, 3) at so many elevations, all around.
+    """A spinning scanner: rays from each of ``origins`` (s, 3) at ``beams`` elevations, all around.
 
-    drift: (s, 3) meters, how far each sweep is off its place. soft: name -> mean depth in meters that rays go into
-    things of this name, and no farther than these are thick. colored: points have colors of photographs, else the
-    grey of their intensity. down, up: elevations of the lowest and the highest beam, degrees. range_m: no return
-    beyond. error_m: of a range, standard deviation.
+    drift: (s, 3) meters, how far each sweep is off its place. soft: name -> mean depth in meters that rays penetrate
+    things of this name, at most their thickness. colored: points have the colors of photographs, else the grey of their
+    intensity. down, up: elevations of the lowest and the highest beam, degrees. range_m: no returns beyond it. error_m:
+    standard deviation of a range.
     """
 
     room: Room
@@ -213,7 +213,7 @@ class Scanner:
     error_m: float = 0.02
 
     def __call__(self, count: int, rng: Random) -> Raw:
-        """What comes back of so many rays; rays into the sky do not."""
+        """The returns of ``count`` rays; rays into the sky have none."""
         surfaces = Surfaces(self.room.objects)
         names = [item.name for item in self.room.objects]
         tones = [part.material for item in self.room.objects for part in item.parts]
@@ -227,7 +227,7 @@ class Scanner:
             back = (hits.part >= 0) & (hits.distance < self.range_m) & (owner != names.index(SKY))
             ray, owner, part = ray[back], owner[back], hits.part[back]
             xyz = origin + ray * hits.distance[back, None]
-            # Into soft things rays go an exponential depth, as through leaves, and never out at their back.
+            # Rays penetrate soft things to an exponential depth, as through leaves, but never out at the back.
             through = np.nan_to_num(surfaces.cast(xyz + 1e-3 * ray, ray).distance)
             deeper = np.minimum(softness[owner] * rng.exponential(size=len(xyz)), 0.9 * through)
             deeper += self.error_m * rng.normal(size=len(xyz))
@@ -239,7 +239,7 @@ class Scanner:
         return _shuffled(found, rng)
 
     def _rays(self, count: int, rng: Random) -> Doubles:
-        """(count, 3) unit directions, each of one of the beams."""
+        """(count, 3) unit directions, each along one of the beams."""
         around = rng.uniform(0, 2 * np.pi, count)
         beam = rng.integers(0, self.beams, count) / (self.beams - 1)
         tilt = np.radians(self.down + (self.up - self.down) * beam)
@@ -248,7 +248,7 @@ class Scanner:
 
 @dataclass(frozen=True)
 class Matched:
-    """Points matched between photographs: at edges of their pictures, the less exact the farther."""
+    """Points matched between photographs: at edges in the images, less exact the farther away."""
 
     room: Room
     frames: Sequence[Frame]
@@ -257,18 +257,18 @@ class Matched:
     error_px: float = 0.4
 
     def __call__(self, count: int, rng: Random) -> Raw:
-        """So many points, as many of each picture."""
+        """About ``count`` points, equally many from each image."""
         sky = next(k for k, item in enumerate(self.room.objects) if item.name == SKY)
         directions, found = self.intrinsics.directions().reshape(-1, 3), []
         for frame in self.frames:
-            # Pixels are drawn by the strength of their edges; a plain wall has few matches, the sky none.
+            # Pixels are drawn by edge strength; a plain wall has few matches, the sky none.
             grey = frame.image.astype(np.float64).mean(axis=2)
             edge = np.abs(np.gradient(grey)).sum(axis=0) + 0.3
             reach = np.cumsum(np.where(frame.owner == sky, 0, edge).ravel())
             pixel = np.searchsorted(reach, rng.random(count // len(self.frames) + 1) * reach[-1], side="right")
             depth = frame.depth_m.ravel()[pixel].astype(np.float64)
             ray = rotated(directions[pixel], frame.camera_to_world[:3, :3])
-            # Of two views a baseline b apart: depth = f b / disparity, so an error of the disparity grows with depth^2.
+            # Two views a baseline b apart: depth = f b / disparity, so a disparity error has an effect ~ depth^2.
             error = (
                 depth**2 * self.error_px / (self.intrinsics.focal_px * self.baseline_m) * rng.normal(size=len(pixel))
             )
@@ -280,7 +280,7 @@ class Matched:
 
 
 def _shuffled(parts: Sequence[tuple[NDArray[Any], ...]], rng: Random) -> Raw:
-    """All parts as one, in random order: the caller takes as many as it wants from the front."""
+    """All parts as one, in random order, so that the caller can take as many as it wants from the front."""
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = rng.permutation(len(columns[0]))
     return Raw(*(column[order] for column in columns))

@@ -1,4 +1,4 @@
-"""What the zoo's scenes show, and a camera's way through them. Frame and units are those of the demo's room."""
+"""The places of the zoo's scenes, and a camera path through each. Frame and units are those of the demo's room."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from og_pointcloud_zoo.outdoors import (
 )
 
 GLASS, MIRROR = "window", "mirror"
-"""Names of what a depth sensor does not see: it looks through the one and into the other."""
+"""Names of things that a depth sensor does not see: it looks through the first and into the second."""
 BOXES = ("box", "crate", "suitcase")
 NAMES = (*CLASS_NAMES, *BOXES, "rack", GLASS, MIRROR, "floor", "wall", "ceiling")
 ALIKE = (
@@ -54,7 +54,7 @@ ALIKE = (
     ("road", "sidewalk"), ("building", "fence"), ("pole", "tree", "person"), ("trail", "grass"), ("bush", "tree"),
     ("rock", "log"),
 )  # fmt: skip
-"""Names that an encoder takes for one another."""
+"""Names that an encoder confuses."""
 ON_ROOF = np.array([0, 0, 0.3])
 """Meters from a vehicle's cameras to its scanner."""
 Pose = NDArray[np.float64]
@@ -63,10 +63,10 @@ Sensor = Callable[[int, Random], Raw]
 
 @dataclass(frozen=True)
 class Place:
-    """room: what stands where. poses(views, surfaces, rng): a camera's way through it, (4, 4) camera-to-world each.
+    """room: what stands where. poses(views, surfaces, rng): the camera path through it, (4, 4) camera-to-world each.
 
     names: of the classes. sensor(frames, intrinsics): what measures the cloud; None: points lie evenly on surfaces.
-    soft: names of things that points lie within, not only upon.
+    soft: names of things that points also lie inside of.
     """
 
     room: Room
@@ -78,7 +78,7 @@ class Place:
 
 @dataclass(frozen=True)
 class _Arc:
-    """Around ``middle`` (3,), over ``angle`` radians about the side that faces -y; radius and height in meters."""
+    """An arc around ``middle`` (3,), of ``angle`` radians centered on the side facing -y; radius, height in meters."""
 
     middle: tuple[float, float, float]
     angle: float
@@ -92,7 +92,7 @@ class _Arc:
             radius, height, target = rng.uniform(*self.radius), rng.uniform(*self.height), rng.normal(size=3)
             x, y, _ = self.middle
             eye = np.array([x + radius * np.cos(turn), y + radius * np.sin(turn), height])
-            for _ in range(20):  # off what stands in the way
+            for _ in range(20):  # up, away from what is in the way
                 if surfaces.distance_m(eye[None])[0] > 0.2:
                     break
                 eye[2] += 0.1
@@ -101,7 +101,7 @@ class _Arc:
 
 
 def _in_shell(rng: Random, items: list[Item], size: tuple[float, float, float]) -> Room:
-    """Items in an otherwise empty room, whose four walls are four things."""
+    """Items in an otherwise empty room, whose four walls are separate things."""
     floor, walls, ceiling = shell(rng, size)
     return Room(size, tuple(items), (floor, *(Item("wall", (part,)) for part in walls.parts), ceiling))
 
@@ -126,7 +126,7 @@ def _box_item(rng: Random) -> Item:
 
 
 def _rack(rng: Random) -> Item:
-    """An upright grid of bars of 8 mm, as a fence or a drying rack is."""
+    """An upright grid of 8 mm bars, like a fence or a drying rack."""
     width, height, bars = rng.uniform(0.7, 1.0), rng.uniform(0.8, 1.1), int(rng.integers(7, 11))
     upright = [box((0.008, 0.008, height), (x, 0, 0), METAL) for x in np.linspace(-width / 2, width / 2, bars)]
     across = [box((width, 0.008, 0.008), (0, 0, z), METAL) for z in np.linspace(0.05, height, 5)]
@@ -170,7 +170,7 @@ def flat(rng: Random, seed: int) -> Place:
             eye = np.array([0.55 * width * np.sin(turn / 2), 0.3 * np.sin(turn), 1.65 + 0.03 * rng.normal()])
             heading = turn + 1.5 * np.sin(2 * turn) + 0.2 * rng.normal()
             while surfaces.distance_m(eye[None])[0] < 0.25:
-                eye[:2] *= 0.9  # at last it stands in the doorway
+                eye[:2] *= 0.9  # moved towards the doorway
             ahead = np.array([np.cos(heading), np.sin(heading), -0.45 + 0.1 * rng.normal()])
             taken.append(looking_at(eye, eye + ahead, 0.03 * rng.normal()))
         return taken
@@ -194,7 +194,7 @@ def shelf(rng: Random, seed: int) -> Place:
 
 
 def shelf_bin(rng: Random, seed: int) -> Place:
-    """The same from close by and nearly from one place: one or two of its compartments."""
+    """The same from close up and nearly one place: one or two of its compartments."""
     far = _at_wall(rng, shelf_group(rng), [], 0.9, (0.7, 0.9))
     return replace(far, poses=_Arc((0.0, 1.8, 0.75), 0.9, (0.75, 0.95), (0.8, 1.2)))
 
@@ -224,7 +224,7 @@ def table(rng: Random, seed: int) -> Place:
 
 
 def board(rng: Random, seed: int) -> Place:
-    """Small things on a table top, filmed from near by; the room around is far."""
+    """Small things on a table top, filmed from close up; the room around is far away."""
     height = 0.74
     makers = [mug, mug, bottle, vase, lying_book, lying_book, small_plant, mug, bottle]
     top = table_of("table", 1.3, 0.9, height, wood(rng))
@@ -256,7 +256,7 @@ def wires(rng: Random, seed: int) -> Place:
 
 
 def head_worn(rng: Random, seed: int) -> Place:
-    """The flat by a camera on somebody's head, who goes from thing to thing and looks at each from close by."""
+    """The flat by a head-worn camera; the wearer goes from thing to thing and looks at each from close up."""
     plain = flat(rng, seed)
 
     def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
@@ -279,8 +279,8 @@ def head_worn(rng: Random, seed: int) -> Place:
 
 
 def _ahead(views: int, place: Callable[[float], np.ndarray], headings: Sequence[float], rng: Random) -> list[Pose]:
-    """A vehicle's cameras in stops along a way; headings: where those of one stop look, degrees left of ahead.
-    place(share): (3,) of the camera at that share of the way."""
+    """A vehicle's cameras at stops along a path; headings: where those of one stop look, degrees left of ahead.
+    place(share): (3,) camera position at that share of the path."""
     poses, stops = [], -(-views // len(headings))
     for step in range(views):
         stop, heading = divmod(step, len(headings))
@@ -297,7 +297,7 @@ def _in_lane(share: float) -> Pose:
 
 
 def drive(rng: Random, seed: int) -> Place:
-    """A street by one camera that looks ahead from a car, its points matched between photographs."""
+    """A street by one camera looking ahead from a car; points are matched between photographs."""
     room = street_room(rng)
     return Place(
         room, lambda views, surfaces, rng: _ahead(views, _in_lane, (0,), rng), STREET,
@@ -306,7 +306,7 @@ def drive(rng: Random, seed: int) -> Place:
 
 
 def lidar(rng: Random, seed: int) -> Place:
-    """A street by a scanner of 32 beams on a car's roof and six cameras around it, that stand a few times."""
+    """A street by a 32-beam scanner on a car's roof and six cameras around it, at a few stops."""
     room = street_room(rng)
     around = (0, 60, 120, 180, 240, 300)
 
@@ -322,7 +322,7 @@ def lidar(rng: Random, seed: int) -> Place:
 
 
 def country(rng: Random, seed: int) -> Place:
-    """Rough country by a robot's scanner and a camera that looks ahead, swaying."""
+    """Rough country by a robot's scanner and a camera looking ahead, swaying."""
     room = country_room(rng)
     soft = {"grass": 0.15, "bush": 0.25, "tree": 0.3}
 
@@ -350,4 +350,4 @@ PLACES: dict[str, Callable[[Random, int], Place]] = {
     "table": table, "board": board, "still": still, "boxes": boxes, "plants": plants, "wires": wires,
     "walk": head_worn, "drive": drive, "lidar": lidar, "country": country,
 }  # fmt: skip
-"""By name; each is made from a random generator and the seed that it was made of."""
+"""By name; each is made from a random generator and that generator's seed."""

@@ -44,7 +44,7 @@ HEADER = (
 
 
 def summary(rows: Sequence[Row]) -> str:
-    """Means, worst and best of each half, and how well a fit's own figure ranks its scenes."""
+    """Means, worst and best of each half, and how well a fit's reliability ranks the scenes."""
     parts: list[str] = []
     for half, title in HALVES.items():
         chosen = sorted((row for row in rows if row.half == half), key=lambda row: row.miou)
@@ -77,7 +77,7 @@ def _means(rows: Sequence[Row]) -> str:
 
 
 def needs_table(rows: Sequence[Row]) -> str:
-    """Means over the scenes, of each way and amount in which they were made worse, in its order: Markdown."""
+    """Means over the scenes for each way and amount of making them worse, in that order: Markdown."""
     text = "| made worse | mIoU | best baseline | background called | unknown | reliability |\n"
     text += "| --- | ---: | ---: | ---: | ---: | ---: |\n"
     for worse in dict.fromkeys(row.worse for row in rows):
@@ -95,7 +95,7 @@ def _mean(values: Iterable[float | None], form: str = "{:.3f}") -> str:
 
 
 def write_needs(rows: Sequence[Row], path: Path) -> Path:
-    """Mean mIoU, ours and of the best baselines, against how much worse the scenes were made: a plot for each way."""
+    """Mean mIoU, ours and of the best baselines, against how much worse the scenes were made: one plot per way."""
     kinds = list(dict.fromkeys(row.worse.partition("=")[0] for row in rows if row.worse))
     figure = require_matplotlib()(figsize=(11, 6), layout="constrained")
     of_kind = figure.subplots(2, -(-len(kinds) // 2), sharey=True, squeeze=False).ravel()
@@ -115,12 +115,12 @@ def write_needs(rows: Sequence[Row], path: Path) -> Path:
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
-    """A line a scene; written whole or not at all."""
+    """One line per scene; written completely or not at all."""
     return write_file(path, csv_text([asdict(row) for row in rows]).encode())
 
 
 def write_picture(rows: Sequence[Row], path: Path) -> Path:
-    """Ours against the best baseline, error against seconds, and mIoU against what the fit says of itself."""
+    """Ours against the best baseline, error against seconds, and mIoU against the fit's reliability."""
     figure = require_matplotlib()(figsize=(15, 5), layout="constrained")
     ours, cost, own = figure.subplots(1, 3)
     for half, title in HALVES.items():

@@ -1,12 +1,12 @@
-"""Photographs of a made scene -> a 3DGS that is really trained on them: sizes, shapes, opacities and colors, densified.
+"""Photographs of a made scene -> a 3DGS actually trained on them: sizes, shapes, opacities and colors, densified.
 
-As published (Kerbl et al., 2023), but for what a small scene does not need: the loss is L1 alone, colors are the same
-from all sides, opacities are not reset. Of a pixel the color is ``C = sum_i T_i a_i c_i + T B``, nearest first, with
-``T_i = prod_{j<i} (1 - a_j)``, ``a_i = o_i exp(-q_i)`` and a gray B behind all; so
+As published (Kerbl et al., 2023), without what a small scene does not need: the loss is L1 alone, colors do not depend
+on the viewing direction, opacities are not reset. A pixel's color is ``C = sum_i T_i a_i c_i + T B``, nearest first,
+with ``T_i = prod_{j<i} (1 - a_j)``, ``a_i = o_i exp(-q_i)`` and a gray B behind everything; so
 
     dC / dc_i = T_i a_i        dC / da_i = T_i c_i - (sum_{j>i} T_j a_j c_j + T B) / (1 - a_i)
 
-which a kernel of our own gathers for each splat; from there to position, size and shape torch takes it.
+which our own kernel sums for each splat; torch propagates it from there to position, size and shape.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ STEPS = 1500
 DENSIFIED = range(300, 1001, 100)
 """Steps at which Gaussians are split, copied and dropped."""
 RATES = {"xyz": 1.6e-4, "log_size": 5e-3, "rotation": 1e-3, "logit": 5e-2, "color": 1e-2}
-"""Adam's steps as published, that of xyz by the extent of the cameras, color's of a sigmoid's argument."""
+"""Adam's learning rates as published; xyz's is relative to the extent of the cameras, color's for a sigmoid's argument.
+"""
 POSITION_END = 0.01
-"""Part of its step that xyz ends with."""
+"""Share of its learning rate that xyz ends with."""
 GROWS_FROM = 2e-4
-"""Mean length of the gradient at a center, by half of the image, from which a Gaussian is densified."""
+"""Mean length of the gradient at a center, in units of half the image, above which a Gaussian is densified."""
 SPLIT_FROM = 0.01
-"""Size, as a part of the extent, from which one is split in two of 1 / SPLIT size, and not copied."""
+"""Size, as a share of the extent, above which a Gaussian is split into two of 1 / SPLIT its size instead of copied."""
 SPLIT = 1.6
 LEAST_OPACITY = 0.005
-"""Less opaque Gaussians go."""
+"""Less opaque Gaussians are dropped."""
 BEHIND = 0.5
-"""The gray behind all."""
+"""The gray behind everything."""
 NEAREST = 0.1
 """Depth of the near plane, meters."""
 REACH = 3.0
@@ -52,8 +53,8 @@ Image = NDArray[np.float32]
 def trained(start: Points, cameras: Sequence[Camera], images: Sequence[Image], most: int, seed: int = 0) -> Points:
     """A 3DGS of what images show.
 
-    start: points with colors to begin with, as structure from motion has them. images: (H, W, 3) in [0, 1], of each
-    camera. most: Gaussians at most.
+    start: initial points with colors, as from structure from motion. images: (H, W, 3) in [0, 1], one per camera. most:
+    maximum number of Gaussians.
     """
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
@@ -107,7 +108,7 @@ def _as_points(now: Parameters, origin: NDArray[np.float64]) -> Points:
 
 
 def _densified(now: Parameters, pull: NDArray[np.float64], extent: float, most: int) -> Parameters:
-    """Small Gaussians that are pulled are copied, large ones split; those that hardly show, or are huge, go."""
+    """Gaussians with a large gradient are copied if small, split if large; faint or huge ones are dropped."""
     now = {name: values.detach() for name, values in now.items()}
     size = now["log_size"].exp().max(dim=1).values.numpy()
     good = (torch.sigmoid(now["logit"]) > LEAST_OPACITY).numpy() & (size < 0.5 * extent)
@@ -132,7 +133,7 @@ def _densified(now: Parameters, pull: NDArray[np.float64], extent: float, most: 
 
 
 def _axes(rotation: torch.Tensor) -> torch.Tensor:
-    """(n, 3, 3) of quaternions (w, x, y, z) of any length."""
+    """(n, 3, 3) rotation matrices of quaternions (w, x, y, z) of any length."""
     w, x, y, z = torch.nn.functional.normalize(rotation, dim=1).unbind(1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -143,8 +144,8 @@ def _axes(rotation: torch.Tensor) -> torch.Tensor:
 
 
 def _backward(now: Parameters, camera: Camera, image: Image) -> NDArray[np.float64]:
-    """Adds the gradients of one view's loss. Returns (n,) the lengths of those at each center, by half of the image; 0
-    for Gaussians that do not show."""
+    """Adds the gradients of one view's loss. Returns (n,) the length of that at each center, in units of half the
+    image; 0 for Gaussians that do not show."""
     pose = torch.from_numpy(camera.world_to_camera.astype(np.float32))
     seen = now["xyz"] @ pose[:3, :3].T + pose[:3, 3]
     depth = seen[:, 2].clamp(min=NEAREST)
@@ -182,7 +183,7 @@ def _backward(now: Parameters, camera: Camera, image: Image) -> NDArray[np.float
 
 @njit(cache=True)
 def _binned(order, depth, splats, reach, width, height):  # noqa: ANN001, ANN202
-    """Members of each tile, nearest first: where each tile's begin, and which."""
+    """The splats of each tile, nearest first: where each tile's begin, and which they are."""
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     start, members = np.zeros(columns * rows + 1, np.int64), np.zeros(0, np.int64)
     place = start
@@ -209,8 +210,8 @@ def _binned(order, depth, splats, reach, width, height):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _gradients(splats, start, members, image):  # noqa: ANN001, ANN202
-    """The mean absolute difference of colors; its gradient (n, 9) by a splat's center, conic, opacity and color; and
-    (n,) which splats show."""
+    """The mean absolute difference of colors; its gradient (n, 9) with respect to each splat's center, conic, opacity
+    and color; and (n,) which splats show."""
     height, width = image.shape[:2]
     columns, scale = (width + TILE - 1) // TILE, np.float32(1 / image.size)
     errors, entries = np.zeros(len(start) - 1), np.zeros((len(members), 9), np.float32)
@@ -241,7 +242,7 @@ def _gradients(splats, start, members, image):  # noqa: ANN001, ANN202
                     through *= 1 - a
                     if through < np.float32(1e-4):
                         break
-                behind = np.float32(0)  # what all that is drawn behind a splat adds to the loss
+                behind = np.float32(0)  # gradient of everything drawn behind a splat
                 for channel in range(3):
                     apart = color[channel] + through * np.float32(BEHIND) - image[row, column, channel]
                     errors[tile] += abs(apart)
@@ -269,8 +270,8 @@ def _gradients(splats, start, members, image):  # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _gathered(members, entries, n):  # noqa: ANN001, ANN202
-    """(n, 9) the entries of each splat added up, and (n,) which have one. On its own: amid a parallel kernel each of
-    these sums would wake all threads."""
+    """(n, 9) the sum of each splat's entries, and (n,) which have one. A separate function, because inside a parallel
+    kernel each of these sums would wake all threads."""
     gradient, shown = np.zeros((n, 9), np.float32), np.zeros(n, np.bool_)
     for e in range(len(members)):
         gradient[members[e]] += entries[e]

@@ -1,14 +1,14 @@
-"""A scene made worse, in one way by so much: what does a capture need, and what does a fit make of less?
+"""A scene made worse in one way, by an amount: what does a capture need, and what does a fit make of less?
 
-views    so many of the views, evenly spread
-points   this share of the points, at random
-noise    every point is off by so many spacings, standard deviation along each axis
-strays   so many points more, as a share of them, anywhere in the scene's box
-poses    every camera is turned to a random side, so that its image is off by so many pixels
+views    only this many views, evenly spread
+points   only this share of the points, at random
+noise    every point is off by this many spacings, standard deviation along each axis
+strays   this many more points, as a share of them, anywhere in the scene's box
+poses    every camera is turned in a random direction, so that its image is off by this many pixels
 masks    this share of the masks is missing
-colors   "noisy": the points' colors with noise; "grey": that without hue; "none": without colors
+colors   "noisy": the points' colors with noise; "grey": those without hue; "none": no colors
 
-The same scene and amount is the same worse scene, always. It is scored at the points that the scene had before.
+The same scene and amount always give the same worse scene. It is scored at the points that the scene had before.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from og_pointcloud.formats.poses import rotation_of_vector
 from og_pointcloud.scene import Points, Scene, View
 
 COLOR_NOISE = 30.0
-"""Standard deviation of noisy colors, of 255 levels: made colors are cleaner than those of a scan."""
+"""Standard deviation of color noise, of 255 levels: made colors are cleaner than those of a scan."""
 COLORS = ("noisy", "grey", "none")
 LADDER: Mapping[str, tuple[float, ...]] = {
     "views": (12, 8, 5, 3),
@@ -35,12 +35,12 @@ LADDER: Mapping[str, tuple[float, ...]] = {
     "poses": (1, 2, 4, 8),
     "masks": (0.25, 0.5, 0.75),
 }
-"""What is tried of each, from little to much."""
+"""The amounts tried of each kind, from little to much."""
 
 
 def worse(scene: Scene, kind: str, amount: Any) -> Scene:
-    """The scene made worse: points that are left keep their order, strays come after them. OgPointcloudError for
-    another kind or amount."""
+    """The scene made worse: remaining points keep their order, strays come after them. OgPointcloudError for any other
+    kind or amount."""
     valid = amount in COLORS if kind == "colors" else isinstance(amount, int | float) and 0 < amount < np.inf
     if kind not in WAYS or not valid or (kind in ("points", "masks") and amount > 1):
         raise OgPointcloudError(

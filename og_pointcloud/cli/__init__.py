@@ -1,11 +1,11 @@
 """The command line: ``og-pointcloud fit | import | segment | pick | view | info | vocabulary | ...``.
 
-A file a command: its docstring is the help (what it does, and an example), ``add`` declares its options, ``run`` does
-the work. A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and ``pick``
-work on the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use
-or bad input, 130 interrupted, 141 nobody reads on.
+One file per command: its docstring is the help (what it does, and an example), ``add`` declares its options, ``run``
+does the work. A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and
+``pick`` work on the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done,
+2 bad usage or bad input, 130 interrupted, 141 broken pipe.
 
-Names and notes in files may be a stranger's: all that is printed goes through `printable`.
+Names and notes in files may come from strangers: everything printed goes through `printable`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ COMMANDS = (
     "report", "demo",
 )  # fmt: skip
 MODULES = {"import": "import_", "eval": "evaluate", "map": "map_", "ros-bag": "ros_bag"}
-"""Command -> its module, where they are not called the same."""
+"""Command -> its module, where their names differ."""
 LONGEST_UNFORESEEN = 300
-"""Characters that are shown of an error that is none of ours."""
+"""Characters shown of an error that is not one of ours."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; argv without the program's name, None for the process's own. Returns the exit code."""
     arguments = argparse.Namespace(debug=True)
-    # Terminals may know few characters, and file names may hold any bytes: both are escaped, not an error.
+    # Terminals may lack characters, and file names may hold any bytes: such characters are escaped, not an error.
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -50,15 +50,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
         check_outputs(arguments)
         with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout or io.StringIO())):  # pyright: ignore
-            warnings.simplefilter("ignore")  # what libraries tell programmers
-            warnings.simplefilter("always", UserWarning)  # what this library tells users
+            warnings.simplefilter("ignore")  # warnings of libraries to programmers
+            warnings.simplefilter("always", UserWarning)  # warnings of this library to users
             warnings.showwarning = print_warning
             arguments.run(arguments)
             sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted: what was not done is not written; the same command does the rest", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # as `| head` does; nothing is left to be said, not even on leaving
+    except BrokenPipeError:  # as by `| head`: nothing more may be printed, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except Exception as error:
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 class Plain:
-    """A stream that passes on what is printed to it, `printable`."""
+    """A stream that passes on what is printed to it, made `printable`."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -83,11 +83,11 @@ class Plain:
 
 
 def describe_error(error: Exception) -> str:
-    """One line: what our own errors say, a path and what the system says of it, else the kind of error too."""
+    """One line: the text of our own errors; a path and the system's message; for any other error its type too."""
     error = missing_extra(error) or error
     if isinstance(error, MemoryError):
         return "out of memory"
-    if isinstance(error, UnicodeEncodeError):  # of bytes in a file's name, which Python keeps as half characters
+    if isinstance(error, UnicodeEncodeError):  # bytes in a file name, which Python keeps as lone surrogates
         name = error.object[max(0, error.start - LONGEST_CELL // 2) :]
         return f"'{printable(name, LONGEST_CELL)}' holds bytes that are no UTF-8: rename the file or folder"
     if isinstance(error, OSError) and error.strerror:
@@ -99,7 +99,7 @@ def describe_error(error: Exception) -> str:
 
 
 def print_warning(message: Warning | str, *_: object) -> None:
-    """In place of Python's two lines with a file name, which say nothing to someone who typed a command."""
+    """In place of Python's two lines with a source file name, which do not help someone who typed a command."""
     print(f"warning: {printable(str(message))}", file=sys.stderr)
 
 

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from og_pointcloud.scene import Points
 
 SHOWN = 12
-"""Words, and instances, that a list shows before it ends in dots."""
+"""Number of words or instances that a list shows before it ends in dots."""
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 LONGEST_CELL, LONGEST_NOTE = 60, 1000
-"""Characters that are shown of a name in a table or list, and of a note."""
+"""Characters shown of a name in a table or list, and of a note."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -46,14 +46,14 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """With a guess at what was meant."""
+        """Adds a guess at what was meant."""
         if action.choices is not None and value not in action.choices:
             expected = f"expected {', '.join(map(str, action.choices))}{did_you_mean(str(value), action.choices)}"
             raise argparse.ArgumentError(action, f"{printable(str(value), LONGEST_CELL)!r} is unknown; {expected}")
 
 
 class Once(argparse.Action):
-    """What an option does unless said otherwise: of several values argparse would take the last without a word."""
+    """The default action of options: refuses a second value, where argparse would silently take the last."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
         given = vars(namespace).setdefault("given", set())
@@ -82,7 +82,7 @@ SHARED: dict[str, dict[str, Any]] = {
 
 
 def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
-    """text: what the command does in a line, an empty line, and an example."""
+    """text: one line on what the command does, an empty line, and an example."""
     summary, _, example = (text or "").strip().partition("\n\n")
     example = "example:\n" + indent(example.strip(), "  ")
     parser = commands.add_parser(name, help=summary, description=summary, epilog=example)
@@ -91,7 +91,7 @@ def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
 
 
 def add_commands(parser: Parser, what: str, *runs: Callable[[argparse.Namespace], None]) -> list[Parser]:
-    """A command below a command for each ``run_NAME``, whose docstring is its text. what: they are."""
+    """A subcommand for each ``run_NAME``, whose docstring is its text. what: the name of the choice among them."""
     below = parser.add_subparsers(dest=what, required=True, metavar=what.upper(), parser_class=Parser)
     return [add_command(below, run.__name__.removeprefix("run_"), run, run.__doc__) for run in runs]
 
@@ -102,18 +102,18 @@ def add_shared(parser: Any, *names: str) -> None:
 
 
 def add_option(parser: Any, name: str, metavar: str | None, help: str, **settings: Any) -> None:
-    """An option or a position with values."""
+    """An option or positional argument with values."""
     parser.add_argument(name, metavar=metavar, help=help, **settings)
 
 
 def add_output(parser: Any, *flags: str, endings: Sequence[str], help: str, **settings: Any) -> None:
-    """An option with a file to write, which `check_outputs` looks at before the command runs."""
+    """An option for a file to write, which `check_outputs` checks before the command runs."""
     settings = {"metavar": f"OUT{endings[0]}", **settings}
     parser.add_argument(*flags, type=Path, help=help, **settings).endings = endings
 
 
 def replaceable(text: str) -> Path:
-    """Type of a path that is read, but that an output may replace or lie in (`check_outputs` guards those of Path)."""
+    """Type of an input path that an output may replace or lie in (`check_outputs` protects inputs of type Path)."""
     return Path(text)
 
 
@@ -123,7 +123,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
     Options of `add_output` are outputs, all other options of type Path inputs.
     """
     actions = [(action, getattr(arguments, action.dest)) for action in arguments.parser._actions if action.type is Path]
-    # Outputs carry their endings, see `add_output`; an input may be several paths.
+    # Outputs have their endings attached (`add_output`); an input may be several paths.
     values = [value if isinstance(value, list) else [value] for action, value in actions if not outputs_of(action)]
     inputs = [path for several in values for path in several if isinstance(path, Path)]
     taken: dict[Path, str] = {}
@@ -131,7 +131,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         if path is None or not (endings := outputs_of(action)):
             continue
         option = action.option_strings[0]
-        if path.suffix not in endings and "" not in endings:  # "": a folder, which may be called as one likes
+        if path.suffix not in endings and "" not in endings:  # "": a folder, of any name
             raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
         check_output(option, path, inputs)
         if path.resolve() in taken:
@@ -140,13 +140,13 @@ def check_outputs(arguments: argparse.Namespace) -> None:
 
 
 def outputs_of(action: argparse.Action) -> Sequence[str]:
-    """The endings that an option's file may have, none if it is no output."""
+    """The endings that an option's file may have; none if it is not an output."""
     return getattr(action, "endings", ())
 
 
 def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
-    """Refuse a folder, an input, an existing file in a folder that is read (but .ogpc files, which are no part of a
-    capture), and what cannot be written."""
+    """Refuse a folder, an input, an existing file in an input folder (except .ogpc files, which are not part of a
+    capture), and a path that cannot be written."""
     resolved, sources = path.resolve(), [source.resolve() for source in inputs]
     if path.is_dir():
         raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
@@ -167,17 +167,17 @@ def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show:
 
 
 def print_json(text: str) -> None:
-    """Print JSON readable as it stands; only what a terminal would act on is escaped, as JSON escapes it."""
+    """Print readable JSON; only characters that a terminal would act on are escaped, in JSON's way."""
     print("".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text.rstrip()))
 
 
 def print_next(*words: object, hint: str = "") -> None:
-    """Close with a command to type next."""
+    """End the output with a command to type next."""
     print(f"next: {hint}{shlex.join(['og-pointcloud', *map(str, words)])}")
 
 
 def as_given(arguments: argparse.Namespace, *options: str) -> list[str]:
-    """Those of these options that were given, with their values, to be typed again."""
+    """The options among these that were given, with their values, for typing them again."""
     values = {option: getattr(arguments, option.removeprefix("--").replace("-", "_")) for option in options}
     return [str(word) for option, value in values.items() if value is not None for word in (option, value)]
 
@@ -188,7 +188,7 @@ def check_at_least(option: str, value: float | None, least: float) -> None:
 
 
 def require_room() -> None:
-    # The room's modules import these as they please: whoever lacks one needs the whole extra.
+    # The room's modules import these where they need them: whoever lacks one needs the whole extra.
     for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
         if find_spec(module) is None:
             raise MissingExtraError(module, "demo")
@@ -218,7 +218,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
 
 
 def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
-    """Print the summary of a fit; it ends in a next command that works as it stands."""
+    """Print the summary of a fit; it ends with a next command that works as printed."""
     from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.text.encoder import find_encoder
 
@@ -244,8 +244,8 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
 
 
 def likely_words(cloud: LabelledCloud) -> list[str]:
-    """Two words that the largest instances of a cloud with a vocabulary fit best, or its first two: words of a data
-    set's list that fit nothing would label everything where there is no word bank."""
+    """Two words that best fit the largest instances of a cloud with a vocabulary, or its first two. Words that fit
+    nothing, as in the list of a data set, would label everything where there is no word bank."""
     from og_pointcloud.ask.labelled_scene import LabelledScene
 
     largest = LabelledScene.from_cloud(cloud).instances.largest()
@@ -254,9 +254,9 @@ def likely_words(cloud: LabelledCloud) -> list[str]:
 
 
 def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:
-    """Write the .ogpc file; returns the cloud with the journal's stages and that of writing added to its provenance.
+    """Write the .ogpc file; returns the cloud with the journal's stages and the writing stage added to its provenance.
 
-    OgPointcloudError, which says where the cloud is kept, where that file cannot be written.
+    OgPointcloudError if the file cannot be written; it says where the cloud was saved instead.
     """
     from og_pointcloud_export import write_bundle
 
@@ -268,7 +268,7 @@ def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledC
         try:
             write_bundle(cloud, output)
         except OSError as error:
-            # A fit may have taken hours: it is kept where there is room, if anywhere.
+            # A fit may have taken hours: it is saved where there is room, if anywhere.
             kept = Path(tempfile.mkdtemp(prefix="og-pointcloud-", dir=scratch_root())) / output.name
             try:
                 write_bundle(cloud, kept)
@@ -297,20 +297,20 @@ def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> No
 
 
 def warn_of_poses(capture: Path, points: Points | None = None) -> None:
-    """Warn of what does not fit together in a capture without its masks. points: those that the poses must fit; None:
-    the capture's, if it has any."""
+    """Warn of inconsistencies in a capture, ignoring its masks. points: those that the poses must fit; None: the
+    capture's, if it has any."""
     from og_pointcloud.checking.check import check_capture, warn_of_doubts
     from og_pointcloud.formats.capture import read_photographed
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is missing there is said by the command itself
+        warnings.simplefilter("ignore")  # the command itself reports what is missing
         scene = read_photographed(capture, points)
     if scene is not None:
         warn_of_doubts(check_capture(scene), shlex.quote(str(capture)))
 
 
 def direction(text: str | None) -> tuple[float, float, float] | None:
-    """The unit vector that --up names; None where it is not given."""
+    """The unit vector given by --up; None if it is not given."""
     if text is None or text in AXES:
         return AXES[text] if text else None
     try:
@@ -324,7 +324,7 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
 
 
 def names_in(text: str | None) -> list[str] | None:
-    """The names of an option like A,B,C; None where it is not given. One with a comma stands in double quotes."""
+    """The names in an option like A,B,C; None if it is not given. A name with a comma is in double quotes."""
     if text is None:
         return None
     rows = csv.reader(text.splitlines(), skipinitialspace=True)
@@ -332,7 +332,7 @@ def names_in(text: str | None) -> list[str] | None:
 
 
 def as_option(names: Sequence[str]) -> str:
-    """The text that `names_in` reads these names in."""
+    """The text that `names_in` parses into these names."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(names)
     return line.getvalue()
@@ -353,7 +353,7 @@ def some_of(words: Sequence[str]) -> str:
 
 
 def labels_file(bundle: Path | str) -> Path:
-    """Where labels are advised to go: never S.ply, which may be the cloud that was fitted."""
+    """Suggested file for labels: never S.ply, which may be the cloud that was fitted."""
     return Path(bundle).with_name(f"{Path(bundle).stem}_labels.ply")
 
 
@@ -376,7 +376,7 @@ def print_provenance(provenance: Mapping[str, Any], capture: Path | str = "CAPTU
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """The first column to the left, numbers to the right."""
+    """Print a table: the first column left-aligned, the others right-aligned."""
     rows = [[printable(cell, LONGEST_CELL) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
     for row in [header, *rows]:
@@ -385,7 +385,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def print_shares(counts: Mapping[str, int], unknown: int, unknown_because: Mapping[Any, int]) -> None:
-    """Points and share of each label that was found and of the unknown ones, and why these are unknown."""
+    """Print points and share of each label found and of "unknown", and why points are unknown."""
     total = max(sum(counts.values()) + unknown, 1)
     present = [(name, count) for name, count in counts.items() if count]
     rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in [*present, ("unknown", unknown)]]

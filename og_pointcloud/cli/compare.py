@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.up and not arguments.html:
         raise OgPointcloudError(f"--up is '{arguments.up}' without --html; expected the page whose view it turns")
-    up = np.array(direction(arguments.up or "z"), np.float64)  # refused before the work
+    up = np.array(direction(arguments.up or "z"), np.float64)  # fails before the work, if invalid
     before, after = load(arguments.before), load(arguments.after)
     changes = compare(before, after)
     if arguments.html:

@@ -77,7 +77,7 @@ def run_capture(arguments: argparse.Namespace) -> None:
 
 
 def capture_cells(score: CaptureScore) -> dict[str, str]:
-    """Column -> what stands there."""
+    """Column -> its text."""
     labels = score.labels
     return {
         "mIoU": percent(labels.miou),
@@ -125,7 +125,7 @@ def run_scannet(arguments: argparse.Namespace) -> None:
 
 
 def scene_scores(said: Score, forced: Score) -> dict[str, Any]:
-    """Scores of one scene and task, JSON-able. said: as the scene answers. forced: where each instance takes its best
+    """Scores of one scene and task, JSON-able. said: of the scene's answers. forced: with each instance given its best
     class, however badly it fits."""
     return {
         "miou": said.miou, "macc": said.macc, "forced_miou": forced.miou, "unknown": said.unknown_share,
@@ -134,7 +134,7 @@ def scene_scores(said: Score, forced: Score) -> dict[str, Any]:
 
 
 def task_means(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the scenes that have a point of the task, and the interval of the mIoU, low and high."""
+    """Means over the scenes that have points of the task's classes, and the interval of the mIoU, low and high."""
     import numpy as np
 
     from og_pointcloud.evaluate.intervals import bootstrap
@@ -148,7 +148,7 @@ def task_means(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:
-    """Scene name -> its labels, in the folder or in the scene's own folder below it."""
+    """Scene name -> its labels file, in the folder or in the scene's own subfolder."""
     files = (*folder.glob(f"*{SCANNET_LABELS}"), *folder.glob(f"*/*{SCANNET_LABELS}"))
     labels_of = {file.name.removesuffix(SCANNET_LABELS): file for file in files}
     if not labels_of:
@@ -182,7 +182,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, scene_names, score_pairs
 
-    # Everything is looked up before anything is rendered, so that what the last scene lacks is named at once.
+    # Everything is looked up before anything is rendered, so that a missing file of the last scene is reported at once.
     wanted = known_scenes(arguments.folder, scene_names(arguments.folder), common.names_in(arguments.scenes))
     labels = [read_scene(arguments.folder, name) for name in wanted]
     files = [prediction_file(arguments.predictions, name) for name in wanted]
@@ -198,7 +198,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
 
 
 def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dict[str, float]]:
-    """Print a row for each scene, the means over scenes, and the intervals over all pairs; returns the means by way."""
+    """Print a row per scene, the means over scenes, and the intervals over all pairs; returns the means of each way."""
     import numpy as np
 
     from og_pointcloud.evaluate.intervals import bootstrap
@@ -208,7 +208,7 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     means = {way: score_scenes(of_way) for way, of_way in ious.items()}
     rows = []
     for name, pairs in scenes.items():
-        # A scene whose labels name no object has no pair, and no mean.
+        # A scene whose labels name no object has neither pairs nor a mean.
         cells = [(of[name].mean(), (of[name] > MIN_IOU).mean()) if pairs else (None, None) for of in ious.values()]
         rows.append((name, str(len(pairs)), *(percent(value) for cell in cells for value in cell)))
     total = sum(map(len, scenes.values()))
@@ -246,7 +246,7 @@ def write_scores(arguments: argparse.Namespace, report: Mapping[str, Any]) -> No
 
 
 def without_nan(value: Any) -> Any:
-    """NaN, where nothing was there to be scored, becomes null: JSON has no word for it."""
+    """NaN, where there was nothing to score, becomes null: JSON has no NaN."""
     if isinstance(value, Mapping):
         return {name: without_nan(inner) for name, inner in value.items()}
     return None if isinstance(value, float) and value != value else value
@@ -260,7 +260,7 @@ def known_scenes(folder: Path, known: list[str], wanted: list[str] | None) -> li
 
 
 def prediction_file(folder: Path, scene: str) -> Path:
-    """The file of one scene in a folder of them; a missing one is an error."""
+    """The file of one scene in a folder of predictions; a missing file is an error."""
     file = folder / f"{scene}.ogpc"
     if not file.is_file():
         raise OgPointcloudError(
@@ -279,5 +279,5 @@ def spread(interval: tuple[float, float] | None) -> str:
 
 
 def signed(interval: Interval) -> str:
-    """A difference with its interval, in points of percent."""
+    """A difference with its interval, in percentage points."""
     return f"{100 * interval.mean:+.1f} ({100 * interval.low:+.1f} to {100 * interval.high:+.1f})"

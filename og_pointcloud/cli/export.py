@@ -59,7 +59,7 @@ def run_image(arguments: argparse.Namespace) -> None:
 
 
 def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | None]:
-    """The folder of the MODEL that was given, and its feature space, as far as both are known by now."""
+    """The folder of the given MODEL, and its feature space if it is known by now."""
     from og_pointcloud.models import fetched_model
 
     if model.is_dir():
@@ -74,7 +74,7 @@ def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | Non
 
 
 def print_export(folder: Path, manifest: Mapping[str, Any], compared: str) -> None:
-    """Print what was made, and how far it is from torch. compared: the manifest's count of it, 'texts' or 'images'."""
+    """Print what was made, and how far it is from torch. compared: what the manifest counts, 'texts' or 'images'."""
     parity = manifest["parity"]
     print(f"feature space '{manifest['feature_space']}': width {manifest['width']}")
     print(f"onnxruntime and torch differ by {parity['max_abs_error']:.1e} at most, over {parity[compared]} {compared}")

@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         print("scores of scenes without a judge say how much better the word fits than other known words do")
     if arguments.html:
         print(f"wrote {arguments.html}")
-    if findings and findings[0].fits:  # by itself a word that fits nothing would label all of a scene without a bank
+    if findings and findings[0].fits:  # a word that fits nothing would label all of a scene without a bank
         best, given = findings[0], common.as_given(arguments, "--text-features")
         file = collection.file(best.scene)
         if file.is_file():

@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.hosts import import_plugin
 
     settings = fit_settings(arguments)
-    # All that can be refused is refused before the first capture is read.
+    # Everything that can be refused is refused before the first capture is read.
     if arguments.rerun:
-        import_plugin(RERUN, "rerun")  # before the work, if it is missing
+        import_plugin(RERUN, "rerun")  # fails before the work, if it is missing
     from og_pointcloud.collection.fit_many import FitOptions
     from og_pointcloud.fitting.tasks import dask_executor
 
@@ -113,7 +113,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     if made := [fit for fit in fits if fit.state == "fitted"]:
         rows = [(fit.name, f"{fit.points:,}", str(fit.instances), f"{fit.seconds:.1f}") for fit in made]
         common.print_table(("capture", "points", "instances", "seconds"), rows)
-    # What failed is told last, and ends in an error, so that a script sees it; what was fitted stays.
+    # Failures are listed last and end in an error, so that a script notices; fitted files stay.
     failed = [fit for fit in fits if fit.state == "failed"]
     there = len(fits) - len(made) - len(failed)
     print(f"{len(made)} fitted, {there} there already, {len(failed)} failed, in {arguments.out}")

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
         write_lance(arguments.output, arguments.lance)
         print(f"wrote {arguments.lance}")
     if collection.words:
-        # What the largest scene fits best: the first word of a data set's list may be an airplane.
+        # The word that fits the largest scene best: the first word of a data set's list may be an airplane.
         largest = max(collection.entries, key=lambda entry: entry.instances)
         with suppress(OgPointcloudError):  # no word is known in its feature space
             for finding in collection.find(collection.words, scenes=largest.name, top=1):

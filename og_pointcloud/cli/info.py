@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def describe_bundle(scene: og.LabelledScene, path: Path) -> dict[str, Any]:
-    """What ``info --json`` prints: the manifest, with the file's size and its words."""
+    """The output of ``info --json``: the manifest, with the file's size and its words."""
     words = list(scene.vocabulary.names) if scene.vocabulary else []
     bank = scene.cloud.word_bank
     return {
@@ -39,7 +39,7 @@ def describe_bundle(scene: og.LabelledScene, path: Path) -> dict[str, Any]:
 
 
 def print_info(scene: og.LabelledScene, path: Path) -> None:
-    """The file's size, frame and words, its largest instances, and how it was made."""
+    """Print the file's size, frame and words, its largest instances, and how it was made."""
     cloud, manifest = scene.cloud, scene.manifest
     words = cloud.vocabulary.names if cloud.vocabulary else ()
     writer = printable(str(manifest.get("written_by", "unknown writer")), 60)

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.mapping.mapper import Mapper
 
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.map")
-    if work.exists() and not holds_map(work):  # it is removed in the end
+    if work.exists() and not holds_map(work):  # it is removed at the end
         raise OgPointcloudError(f"--work is '{work}', which holds other files than a map; expected a new folder's name")
     if work.exists() and not arguments.resume:
         raise OgPointcloudError(f"'{work}' holds a map that was interrupted: add --resume, or remove it")
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"left out: {count} x {why}", file=sys.stderr)
     if rest := left_out[SHOWN:]:
         print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)
-    if not taken and not arguments.resume:  # nothing to save, as the next line says, nor to go on with
+    if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
         shutil.rmtree(work)
     mapper.save(arguments.output)
     shutil.rmtree(work)

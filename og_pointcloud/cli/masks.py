@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
         words=tuple(arguments.words),
         tracks=arguments.tracks,
     )
-    # Before masks are made, which may take hours.
+    # Checked before masks are made, which may take hours.
     warn_of_poses(arguments.capture)
     if arguments.encoder == "demo":
         warnings.warn(

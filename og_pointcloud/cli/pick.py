@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     scene = og.load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
-    # A click is as good as the camera's pose: it is checked against the fitted cloud.
+    # A click is only as good as the camera's pose, which is checked against the fitted cloud.
     if camera is not None:
         common.warn_of_poses(arguments.capture, Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb))
     if arguments.pixel is not None and camera is not None:
@@ -71,7 +71,7 @@ def world_camera(capture: Path, name: str) -> og.Camera:
 def describe_pick(
     hit: og.Pick, words: Sequence[tuple[str, float]], mask: Path | None, mask_pixels: int | None
 ) -> dict[str, Any]:
-    """What ``pick --json`` prints: the instance, or why there is none, and where the click hit."""
+    """The output of ``pick --json``: the instance, or why there is none, and where the click hit."""
     return {
         "instance": hit.instance,
         "found": hit.found,

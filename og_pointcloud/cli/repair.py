@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     stated = [] if arguments.only else [str(repair) for repair in read_repairs(capture)]
     new = [str(Repair.parse(text)) for text in arguments.repairs]
-    if not new:  # what the checks would do about the first doubt that they know a repair for
+    if not new:  # the repair that the checks suggest for the first doubt that has one
         checks = check_capture(read_capture(capture, repairs=stated))
         new = next((check.repair.split() for check in checks if check.verdict == "doubt" and check.repair), [])
         if not new:
@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
             doubts = any(check.verdict == "doubt" for check in checks)
             print("no repair is known that would help" if doubts else "nothing was found that needs a repair")
             return
-    # Read with the repairs before they are written: those that make no sense of the capture are refused here.
+    # Read with the repairs before writing them: repairs that the capture cannot be read with are refused here.
     checks = check_capture(read_capture(capture, repairs=[*stated, *new]))
     write_json(file, {"repairs": [*stated, *new]})
     print_checks([check.as_dict() for check in checks], capture)

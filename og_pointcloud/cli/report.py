@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     require_matplotlib()
     few = QUICK_KNOBS if arguments.quick else None
     settings = settings_of(tuple(arguments.knob) if arguments.knob else few)
-    # All are read before the first is worked on: what is missing in the last is told at once.
+    # All are read before work on the first begins: what the last one lacks is reported at once.
     subjects = [read_subject(folder) for folder in arguments.captures]
     swept = sweep(subjects, settings)
     write_rows(swept.rows, rows)

@@ -44,7 +44,7 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
         print(f"skipped {report.skipped.total():,} clouds, which have no labels:")
         for reason, count in report.skipped.most_common(SHOWN_REASONS):
             print(f"  {count:,} x {reason}")
-    pace = max(report.seconds, 1e-9)  # of clouds alone: reading and writing the bag also takes time
+    pace = max(report.seconds, 1e-9)  # of the clouds alone, without reading and writing the bag
     print(f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s")
     print(
         f"clouds alone {pace:.1f} s: {report.clouds / pace:.1f} clouds and {report.points / pace:,.0f} points a second"

@@ -17,7 +17,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.journal import Journal
 
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
-"""The same as `og_pointcloud.ask.segmentation.SAVED_AS`, repeated here since --help does not import numpy."""
+"""Same as `og_pointcloud.ask.segmentation.SAVED_AS`, repeated because --help must not import numpy."""
 
 
 def add(parser: Parser) -> None:
@@ -42,11 +42,11 @@ def run(arguments: argparse.Namespace) -> None:
         pose = None if arguments.pose is None else read_numbers(arguments.pose, 4)
         features = arguments.text_features
         result = og.segment(arguments.points or scene, labels, scene, pose=pose, text_features=features)
-    # Splats, and what a LAS file says of its points, are kept as the file has them: not where a pose moves them.
+    # Splats and the attributes of LAS points are kept as in the file, unless a pose moves them.
     unmoved = None if arguments.pose else arguments.points
     if arguments.output:
         with journal.stage("save"):
-            # Formats of splats are written as splats, where the points asked about are some.
+            # Splat formats are written as splats if the labelled points are splats.
             points = og.read_points(unmoved) if unmoved and arguments.output.suffix in (".glb", ".spz") else None
             splats = points if points is not None and points.are_gaussians else None
             result.save(arguments.output, splats, unmoved)
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     words = common.as_given(arguments, "--labels", "--text-features")
     if not (result.labels >= 0).any():
-        return  # the warning says what helps; there is nothing to keep or to look at
+        return  # the warning says what helps; there is nothing to save or view
     if arguments.output is None:
         words += [*common.as_given(arguments, "--points", "--pose"), "-o", common.labels_file(arguments.bundle)]
         common.print_next("segment", arguments.bundle, *words, hint="to keep the labels: ")
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
 def describe_segmentation(
     result: og.Segmentation, journal: Journal, bundle: Path, output: Path | None
 ) -> dict[str, Any]:
-    """What ``segment --json`` prints: points of each name, and why the others are unknown."""
+    """The output of ``segment --json``: points of each name, and why the others are unknown."""
     return {
         "bundle": str(bundle),
         "output": str(output) if output else None,
@@ -82,7 +82,7 @@ def describe_segmentation(
 
 
 def print_segmentation(report: Mapping[str, Any]) -> None:
-    """The names that were found, in the order asked, and the share that stays unknown."""
+    """Print the names that were found, in the given order, and the share that stays unknown."""
     common.print_shares(report["counts"], report["unknown"], report["unknown_because"])
     absent = [name for name, count in report["counts"].items() if not count]
     if absent:

@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not selection.calibrated:
         print(f"not calibrated: scores are cosines. {common.calibration_hint(arguments.bundle)}")
     if selection.fitting:
-        # `edit` takes a word's instances among all words that are known: among others their ids name them.
+        # `edit --word` chooses instances among all known words: after a choice among other words, ids are given.
         word = ["--word", arguments.text, *common.as_given(arguments, "--text-features")]
         what = word if against is None else ["--id", ",".join(map(str, selection.instances))]
         common.print_next("edit", "extract", arguments.bundle, *what, "-o", "selected.ply")

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.formats.points import read_points
     from og_pointcloud.show.live import LiveScene
 
-    up = direction(arguments.up or "z")  # refused before the work
+    up = direction(arguments.up or "z")  # fails before the work, if invalid
     served = import_plugin("og_pointcloud.show.serve", "serve")
     shown = read_points(arguments.cloud) if arguments.cloud else None
     labels = names_in(arguments.labels)
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
         else:
             print("for this machine alone; --host 0.0.0.0 lets others in, without a password", flush=True)
         page.wait()
-    except KeyboardInterrupt:  # before it waited
+    except KeyboardInterrupt:  # interrupted before the page waited
         page.stop()
 
 
@@ -74,6 +74,6 @@ def _two_visits(earlier: Path, later: Path, labels: Labels, text_features: TextF
 
 
 def titles(paths: list[Path]) -> dict[str, Path]:
-    """The paths by their names, or whole where two have the same name."""
+    """The paths by their names, or by full path where two have the same name."""
     stems = [path.stem for path in paths]
     return {path.stem if stems.count(path.stem) == 1 else str(path): path for path in paths}

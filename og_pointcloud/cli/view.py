@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.show.page import Look, write_page
     from og_pointcloud.show.viewpoint import choose_viewpoint
 
-    up = np.array(common.direction(arguments.up or "z"), np.float64)  # refused before the work
+    up = np.array(common.direction(arguments.up or "z"), np.float64)  # fails before the work, if invalid
     journal = Journal(progress=False)
     with journal.stage("load"):
         scene = og.load(arguments.bundle)
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no point to show; expected at least one")
-    height = result.xyz[shown] @ up  # the view is chosen for what --cut leaves, as the page begins
+    height = result.xyz[shown] @ up  # the view is chosen for the points left by --cut, as when the page opens
     shown[shown] = height <= height.max() - arguments.cut * np.ptp(height)
     view = choose_viewpoint(result.xyz[shown], result.labels[shown] >= 0, up)
     mode = "instances" if arguments.instances else "labels"
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"left out of the page: {left_out}")
     if result.names:
         print_segmentation(describe_segmentation(result, journal, arguments.bundle, page))
-    else:  # --instances of a scene without words: no label was asked for
+    else:  # --instances, and a scene without words: there are no labels
         share = float((result.instances >= 0).mean())
         print(f"{share:.1%} of {counted(len(result), 'point')} in {counted(len(scene.cloud.instances), 'instance')}")
         print(f"wrote {page}")

@@ -51,7 +51,7 @@ def run_add(arguments: argparse.Namespace) -> None:
 
 
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
-    """The text encoder in --text-encoder, else that of the scene's feature space; FeatureSpaceError for another's."""
+    """The text encoder in --text-encoder, else that of the scene's feature space; FeatureSpaceError if they differ."""
     from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder

@@ -1,1 +1,1 @@
-"""OpenGaussian's method: instance features and a codebook, learned; as published, and without rendering."""
+"""OpenGaussian's learned instance features and codebook, both as published and without rendering."""

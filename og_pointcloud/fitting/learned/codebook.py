@@ -1,8 +1,8 @@
 """Instance features -> clusters: the two-level codebook (paper, Sec. 3.2, Eq. 3 and 4), without rendering.
 
-Eq. 4 asks that the map rendered from cluster centers c is near the one rendered from the features f themselves. As
-blending is linear and its weights are positive, ``|W f - W c| <= sum_g w_g |f_g - c_g|``. A k-means in which each
-Gaussian weighs what it shows makes the right side small, and needs neither pixels nor gradients.
+Eq. 4 makes the map rendered from cluster centers c close to the one rendered from the features f themselves. As
+blending is linear and its weights are positive, ``|W f - W c| <= sum_g w_g |f_g - c_g|``. A k-means that weights each
+Gaussian by how much of it shows makes the right side small, without pixels or gradients.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import CodebookSettings
 
 BLOCK = 256
-"""Points whose distances are computed together: their 9 columns take 9 KB, which a first-level cache holds."""
+"""Points whose distances are computed together: their 9 columns take 9 KB, which fits into a first-level cache."""
 SEED_POINTS = 1 << 15
-"""First centers are sought among at most this many of the points."""
+"""First centers are chosen from at most this many points."""
 STARTS = 4
 """Seeds tried; the one with the smallest spread is taken. An unlucky seed puts two things in one cluster."""
 
 
 @dataclass(frozen=True)
 class Codebook:
-    """Clusters of n Gaussians on two levels; the leaves are the finer ones, numbered by their coarse cluster.
+    """Two levels of clusters of n Gaussians; the leaves are the fine ones, in the order of their coarse clusters.
 
     coarse, leaf: (n,) int32, -1 for Gaussians without weight. coarse_centers (k1, width), leaf_centers (k, width)
     float32, mean features. leaf_coarse: (k,) int32, ascending. levels: 1 where each coarse cluster is one leaf.
@@ -54,20 +54,20 @@ def two_level_codebook(
 ) -> Codebook:
     """Eq. 3: coarse clusters of [features; positions], then clusters of the features alone within each.
 
-    features: (n, width), as the losses saw them. xyz: (n, 3). weight: (n,), how much each Gaussian shows; one of weight
-    0 is in no cluster. table: of the same Gaussians; it tells the number of clusters where the settings do not.
-    Deterministic in the seed.
+    features: (n, width), as the losses saw them. xyz: (n, 3). weight: (n,), how much of each Gaussian shows; one of
+    weight 0 is in no cluster. table: of the same Gaussians; gives the numbers of clusters that settings leave open.
+    Deterministic for a given seed.
     """
     taking_part = np.flatnonzero(weight > 0)
     coarse, leaf = np.full(len(features), -1, np.int32), np.full(len(features), -1, np.int32)
     values, mass = np.ascontiguousarray(features[taking_part], np.float32), weight[taking_part].astype(np.float64)
     placed = np.concatenate([values, _scaled_positions(xyz[taking_part], settings)], axis=1)
     rng = np.random.default_rng(seed)
-    # Coarse: positions keep apart things that no view shows together, whose features nothing has pushed apart.
+    # Coarse: positions separate things that no view shows together, as nothing has pushed their features apart.
     k1 = settings.k1 or thing_count(table)
     coarse[taking_part], k1 = _clusters(placed, mass, k1, settings.rounds, rng)
 
-    # Fine: into as many as masks of one view say, so that a cluster that holds one thing stays whole.
+    # Fine: as many as one view has masks in the cluster, so that a cluster that holds one thing stays whole.
     fine_count = np.ones(k1, np.int64)
     if settings.levels == 2:
         together = things_together(table, coarse, k1, settings)
@@ -89,32 +89,32 @@ def two_level_codebook(
 
 
 def thing_count(table: MaskTable) -> int:
-    """About how many things the masks of all views show: each mask counts one over the views that mask its points.
+    """Estimated number of things in the masks of all views: a mask counts 1 / (number of views that mask its points).
 
     Ten masks of one thing, each in another view, count a tenth each. No correspondence between views is needed.
     """
     views = table.outside.shape[0]
     in_masks = csr_array(indicator(table.mask_view, views) @ table.weights)
-    # (views, n): one over all that a view shows of a Gaussian, in masks and outside; only where it shows any.
+    # (views, n): 1 / (all that a view shows of a Gaussian, in masks and outside), only where it shows any.
     reciprocal = csr_array(in_masks + table.outside)
     reciprocal.eliminate_zeros()
     reciprocal.data = 1 / reciprocal.data
-    # A view masks a Gaussian by a share: at a mask's edge a splat lies partly outside.
+    # A view masks a share of a Gaussian: at a mask's edge a splat lies partly outside.
     views_masking = np.asarray(in_masks.multiply(reciprocal).sum(axis=0), np.float64)
     shown = np.asarray(table.weights.sum(axis=1), np.float64)
     shows = shown > 0
     times_masked = (table.weights @ views_masking)[shows] / shown[shows]
-    # Each mask was seen by its own view at least; where edges leave less than 1, it still is one thing at most.
+    # At least its own view masks it; where edges leave less than 1, it is still at most one thing.
     return max(1, round(float((1 / np.maximum(times_masked, 1)).sum())))
 
 
 def things_together(
     table: MaskTable, cluster: NDArray[np.int32], count: int, settings: CodebookSettings
 ) -> NDArray[np.int64]:
-    """(count,) at least 1: how many different masks of one view fall into each cluster, in most of the views.
+    """(count,) at least 1: the number of masks of one view in each cluster, which most views do not exceed.
 
-    Masks of one view are different things (Eq. 2 rests on this too). A mask falls into a cluster when a fair share of
-    the mask lies in it, or it makes up a fair share of what the view shows of the cluster.
+    Masks of one view are different things (Eq. 2 assumes this too). A mask falls into a cluster when a fair share of
+    the mask lies in it, or when it makes up a fair share of what the view shows of the cluster.
     """
     inside = weights_by_instance(table.weights, cluster, count)
     in_view = np.zeros((int(table.mask_view.max(initial=-1)) + 1, count))
@@ -125,7 +125,7 @@ def things_together(
     falls = (inside > share * of_mask) | (inside > share * in_view[table.mask_view])
     masks = np.zeros_like(in_view)
     np.add.at(masks, table.mask_view, falls)
-    # Views without a mask in a cluster are left out: they do not say that it holds nothing. "higher" is a view's count.
+    # Views without a mask in a cluster are left out: that does not mean it is empty. "higher": some view's own count.
     seen = np.where(masks > 0, masks, np.nan)
     together = np.ones(count, np.int64)
     known = (masks > 0).any(axis=0)
@@ -142,22 +142,22 @@ def kmeans(
     """Lloyd's weighted k-means from the given centers, until nothing changes or ``rounds`` updates are done.
 
     values: (n, d) finite. weight: (n,) not negative; points of weight 0 are assigned but move no center.
-    centers: (k, d). A cluster without weight starts again at the worst represented point, the one with the largest
-    weight times squared distance to its center; where every point lies on its center, the cluster stays.
+    centers: (k, d). A cluster without weight restarts at the worst represented point, the one with the largest weight
+    times squared distance to its center; where every point lies on its center, the cluster stays.
 
-    Returns (n,) int32, the nearest of the returned centers (lowest of equals), and those centers (k, d) float32.
-    The same input gives the same answer on any number of threads. Neither offset nor unit of the values matters.
+    Returns (n,) int32, the nearest of the returned centers (ties: the lowest), and those centers (k, d) float32. The
+    result does not depend on the number of threads, nor on the offset and unit of the values.
     """
     # scikit-learn's KMeans reaches the same spread (within 4 % over seeds) in the same time: 1.2 s of processor time
-    # against 1.3 s here in a room of 260,000 points, where mode fast then has mIoU 0.946 to 0.955, with ours 0.955 to
-    # 0.958. It would bring more packages, and its sums depend on the number of threads. scipy.cluster.vq takes no
+    # against 1.3 s here in a room of 260,000 points, where mode fast has mIoU 0.946 to 0.955 with it, 0.955 to 0.958
+    # with ours. It would add dependencies, and its sums depend on the number of threads. scipy.cluster.vq takes no
     # weights.
     _check(values, weight)
     n = len(values)
     if n == 0:
         return np.zeros(0, np.int32), centers.astype(np.float32)
     weight = np.ascontiguousarray(weight, np.float64)
-    # Distances are float32: about a middle (of some thousand values), in units of the largest, they keep their digits.
+    # Distances are float32: values centered (on the middle of some thousand) and scaled by the largest keep precision.
     middle = np.median(values[:: -(-n // 1000)], axis=0)
     points = np.subtract(values, middle, dtype=np.float32)
     unit = max(float(points.max()), -float(points.min())) or 1.0
@@ -171,7 +171,7 @@ def kmeans(
         moved[filled] = sums[filled] / mass[filled, None]
         if not filled.all():
             moved = _reseeded(points, weight, own, moved, np.flatnonzero(~filled))
-        # Points are assigned by centers in float32: where these are the same, so is everything after.
+        # Points are assigned by float32 centers: once these stay the same, nothing changes any more.
         if np.array_equal(moved.astype(np.float32), moving.astype(np.float32)):
             break
         moving = moved
@@ -182,10 +182,10 @@ def kmeans(
 def seed_centers(
     values: NDArray[np.float32], weight: NDArray[np.floating], k: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Up to k of the values as first centers, each drawn with a chance of weight x squared distance to the others.
+    """Up to k of the values as first centers, each drawn with probability proportional to weight x squared distance to
+    the centers before it: weighted k-means++ (Arthur & Vassilvitskii 2007).
 
-    That is k-means++ (Arthur & Vassilvitskii 2007), weighted. Fewer than k, (m, d) with m < k, where the points that
-    have weight lie in only m places; none if no point has weight.
+    (m, d) with m < k where the points that have weight lie in only m places; none if no point has weight.
     """
     candidates = np.flatnonzero(weight > 0)
     if len(candidates) > SEED_POINTS:
@@ -194,7 +194,7 @@ def seed_centers(
     chance = weight[candidates].astype(np.float64)
     squared = np.full(len(points), np.inf)
     chosen: list[int] = []
-    while len(chosen) < k and chance.any():  # no chance is left once a center lies at every place
+    while len(chosen) < k and chance.any():  # all zero once every place has a center
         reached = np.cumsum(chance)
         chosen.append(int(np.searchsorted(reached, rng.random() * reached[-1], side="right")))
         squared = np.minimum(squared, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
@@ -205,10 +205,10 @@ def seed_centers(
 def _clusters(
     values: NDArray[np.float32], weight: NDArray[np.float64], k: int, rounds: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int32], int]:
-    """At most k clusters of values that have weight, numbered without gaps: (n,) int32 and their number."""
+    """At most k clusters of values of weight above 0: (n,) int32, numbered without gaps, and their number."""
     if k <= 1 or len(values) == 0:
         return np.zeros(len(values), np.int32), min(1, len(values))
-    # Starts are compared on every so-many-th point; only the best one's centers are then refined on all.
+    # Starts are compared on a subsample; only the best one's centers are then refined on all points.
     sample = slice(None, None, -(-len(values) // SEED_POINTS))
     least, best = np.inf, values[:0]
     for _ in range(STARTS):
@@ -223,10 +223,10 @@ def _clusters(
 
 
 def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> NDArray[np.float32]:
-    """Positions in units that compare with features: the scene's extent is ``position_weight``."""
+    """Positions scaled to compare with features: the scene's extent becomes ``position_weight``."""
     if len(xyz) == 0:
         return xyz
-    # Strays neither set the extent (the middle 90 % do) nor, clipped, get clusters of their own.
+    # Outliers do not affect the extent (of the middle 90 %), and are clipped so as not to get clusters of their own.
     low, middle, high = np.quantile(xyz, [0.05, 0.5, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(xyz, axis=0))) or 1.0
     return (settings.position_weight * np.clip((xyz - middle) / extent, -1, 1)).astype(np.float32)
@@ -235,7 +235,7 @@ def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> N
 def _means(
     values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
 ) -> NDArray[np.float32]:
-    """(count, d) weighted means of clusters, none of which is empty."""
+    """(count, d) weighted means of clusters; none may be empty."""
     sums, mass = _cluster_sums(values, weight, own, count)
     return (sums / mass[:, None]).astype(np.float32)
 
@@ -244,7 +244,7 @@ def _cluster_sums(
     values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted sum of the values (count, d) and weight (count,) of every cluster, in float64."""
-    # A column a point, with one entry: scipy adds them up in the points' order, on one thread.
+    # One column per point, with one entry: scipy adds them up in the order of points, on one thread.
     membership = csc_array((weight, own, np.arange(len(own) + 1)), shape=(count, len(own)))
     return membership @ values, np.asarray(membership.sum(axis=1), np.float64)
 
@@ -280,14 +280,14 @@ def _reseeded(
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
 def _nearest(points, centers):  # noqa: ANN001, ANN202
-    """(n,) int32: the center nearest to each point (n, d), the lowest of equals."""
+    """(n,) int32: the center nearest to each point (n, d); ties: the lowest."""
     n, d = points.shape
     nearest = np.zeros(n, np.int32)
     for block in prange((n + BLOCK - 1) // BLOCK):
         begin, end = block * BLOCK, min((block + 1) * BLOCK, n)
         size = end - begin
-        # The block transposed, a row for each coordinate: the loops over b then read neighbors in memory and have no
-        # branches, so that the compiler makes vector code of them.
+        # The block transposed, one row per coordinate: the loops over b then read contiguous memory and have no
+        # branches, so that the compiler vectorizes them.
         columns = np.empty((d, size), np.float32)
         for b in range(size):
             for i in range(d):
@@ -301,7 +301,7 @@ def _nearest(points, centers):  # noqa: ANN001, ANN202
                 for b in range(size):
                     difference = column[b] - value
                     squared[b] += difference * difference
-            # Strictly nearer: of centers equally near the first one stays.
+            # Strictly nearer: of equally near centers the first one stays.
             for b in range(size):
                 nearer = squared[b] < least[b]
                 best[b] = np.int32(j) if nearer else best[b]

@@ -10,15 +10,15 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
     1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2).
     A view without two masks has none. The printed form has e = 0 and is infinite where two means meet; here e is
     `FeatureSettings.closest`, after rounds with e = COARSE_BOUNDS.
-``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels:
+``L_s``, intra-mask smoothness (Eq. 1), over the Gaussians that show in a mask instead of the rendered pixels:
     the sum of ``A_ig |f_g - Mbar_i|^2``, which is ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with ``c = A' 1``,
     divided by P.
-    N_i is a mask's *blended weight*, the sum of row i of A, so that coverage does not look like feature; P the sum of
-    all N_i. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the pixel's coverage,
-    which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only each blend.
+    N_i is a mask's *blended weight*, the sum of row i of A, so that coverage does not act as a feature; P is the sum of
+    all N_i. By Jensen's inequality the sum bounds that over pixels of ``|M_p - a_p Mbar_i|^2``, where a_p is the
+    pixel's coverage: the printed loss where a_p = 1. It is stricter: each Gaussian must agree, not only each blend.
 
 Divided by P, Eq. 1 weighs the same at any image size; otherwise it is the paper's sum over a random view. With raw
-features its weight only sets their scale: Eq. 1 grows as the scale's square, Eq. 2 falls as its square.
+features its weight only sets their scale: Eq. 1 grows with the square of the scale, Eq. 2 falls with it.
 """
 
 from __future__ import annotations
@@ -36,35 +36,35 @@ from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import FeatureSettings
 
 COARSE_BOUNDS = (0.71, 0.57, 0.14)
-"""The bound e of Eq. 2 in the rounds before the last: wider ones have fewer local minima. Directions at right angles
+"""The bound e of Eq. 2 in the rounds before the last: larger ones have fewer local minima. Directions at right angles
 read 0.71 apart."""
 COARSE_TOLERANCE = 10.0
-"""Rounds before the last end at this many times the tolerance: the next one moves the features anyway."""
+"""Rounds before the last use this many times the tolerance: the next one moves the features anyway."""
 WINDOW = 10
-"""Steps over which the fall of the objective is measured."""
+"""Steps over which the decrease of the objective is measured."""
 LEVEL = 0.01
-"""The fall is relative to the objective, but at least to this share of its first value: the objective may tend to 0."""
+"""The decrease is relative to the objective, or to this share of its first value if larger: it may tend to 0."""
 MEMORY = 6
 """Steps remembered by L-BFGS (Nocedal & Wright 2006, Sec. 7.2; 3 to 20 are usual)."""
 DOT_PART = 8192
 """Length of the partial sums of dot products, each in float32."""
 FIRST_REACH = 0.5
-"""How far the first step moves the feature that it moves most: no curvature is known yet that would tell."""
+"""How far the first step moves the feature that it moves most, as no curvature is known yet."""
 SUFFICIENT = 1e-4
-"""Armijo's share of the fall that the slope promises (Nocedal & Wright, Eq. 3.4)."""
+"""Armijo: a step must achieve this share of the decrease that the slope predicts (Nocedal & Wright, Eq. 3.4)."""
 HALVINGS = 20
-"""Lengths of a step that are tried, each half of the one before."""
+"""Step lengths tried, each half of the one before."""
 
 Evaluate = Callable[[NDArray[np.float32]], tuple[float, NDArray[np.float32]]]
-"""Raw features -> the objective and its gradient by them."""
+"""Raw features -> the objective and its gradient with respect to them."""
 Pair = tuple[NDArray[np.float32], NDArray[np.float32], float]
 """A step, the change of the gradient along it, and their product."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """cohesion: Eq. 1 over all masked pixels. objective: the weighted sum of Eq. 2, as a mean over views, and of Eq. 1,
-    without the terms that are off. gradient: of the objective, (n, width) in the features' dtype."""
+    """cohesion: Eq. 1 over all masked pixels. objective: the weighted sum of Eq. 2, as a mean over views, and Eq. 1,
+    without terms that are off. gradient: of the objective, (n, width) in the features' dtype."""
 
     cohesion: float
     objective: float
@@ -76,9 +76,9 @@ class LearnedFeatures:
     """Features of n Gaussians and how they were found.
 
     features: (n, width) float32 as read (see `read_features`); rows of zeros where no mask sees the Gaussian.
-    seen: (n,) float64, pixels of blending weight in masks; 0: the feature says nothing.
+    seen: (n,) float64, pixels of blending weight in masks; 0: the feature is meaningless.
     objective: float64, before the last round and after each of its steps; it falls in each. steps: of all rounds.
-    converged: False where `FeatureSettings.max_steps` came first.
+    converged: False where `FeatureSettings.max_steps` was reached first.
     """
 
     features: NDArray[np.float32]
@@ -91,19 +91,19 @@ class LearnedFeatures:
 def learn_features(table: MaskTable, settings: FeatureSettings | None = None, seed: int = 0) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
-    Each mask draws a random direction from the seed and each Gaussian starts at the mean of its masks', so that
-    Gaussians of the same masks start together.
+    Each mask gets a random direction from the seed, and each Gaussian starts at the mean of its masks' directions, so
+    that Gaussians of the same masks start together.
 
     The same input and seed give the same features. Raises SceneError if no mask shows a Gaussian.
     """
     settings = settings or FeatureSettings()
     problem = FeatureObjective(table, settings)
     rng = np.random.default_rng(seed)
-    # A normal vector of unit length has every direction with the same chance.
+    # Normalized Gaussian vectors are uniformly distributed directions.
     random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
     raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)  # masks may cancel
-    # From a smooth objective to the one that is wanted; all rounds share one budget of steps.
+    # From a smooth objective to the final one; all rounds share one budget of steps.
     objective, steps, converged = [0.0], 0, False
     for closest in (*COARSE_BOUNDS, settings.closest):
         tolerance = settings.tolerance * (1 if closest == settings.closest else COARSE_TOLERANCE)
@@ -117,23 +117,23 @@ def learn_features(table: MaskTable, settings: FeatureSettings | None = None, se
 def read_features(raw: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
     """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
 
-    Without the ball, raw features would grow without end: Eq. 2 alone is smallest at infinity, and Eq. 1 holds it back
+    Without the ball, raw features would grow without bound: Eq. 2 alone is smallest at infinity, and Eq. 1 limits it
     only where masks share Gaussians. A zero row has no direction; normalized, it reads 0.5.
     """
     return _read(raw, normalize, _columns(raw))
 
 
 def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
-    """The gradient by raw features (n, width), given the gradient by what `read_features` makes of them."""
+    """The gradient with respect to raw features (n, width), given that with respect to their `read_features`."""
     return _raw_gradient(raw, gradient, normalize, _columns(raw))
 
 
 class FeatureObjective:
     """Value and gradient of the losses over all views, for features as read.
 
-    Only Gaussians that a mask shows take part: ``shown`` (k,) are their rows, all features here are (k, width).
-    ``seen`` (n,) float64 is the blending weight of all Gaussians in masks, ``weight`` (k, 1) float32 that of the shown.
-    Masks that show none are left out.
+    Only Gaussians that a mask shows take part: ``shown`` (k,) are their rows, and all features here are (k, width).
+    ``seen`` (n,) float64 is the blending weight of all Gaussians in masks, ``weight`` (k, 1) float32 that of those
+    shown. Masks that show none are left out.
     """
 
     def __init__(self, table: MaskTable, settings: FeatureSettings) -> None:
@@ -141,7 +141,7 @@ class FeatureObjective:
         # In float64: where features agree, Eq. 1 is a small difference of large sums. (scipy's own sums stay float32.)
         weight = table.weights @ np.ones(table.weights.shape[1])
         self.seen = np.bincount(table.weights.indices, table.weights.data, table.weights.shape[1]).astype(np.float64)
-        # What no mask shows has no gradient: it takes no part. Masks without a Gaussian have no mean.
+        # Gaussians that no mask shows have no gradient and are left out. Masks without a Gaussian have no mean.
         self.shown = np.flatnonzero(self.seen > 0)
         self.weight = self.seen[self.shown, None].astype(np.float32)
         kept = np.flatnonzero(weight > 0)
@@ -151,9 +151,9 @@ class FeatureObjective:
                 "poses and cloud share one frame"
             )
         self._weights = _int32(table.weights[kept][:, self.shown])
-        self._weights.sort_indices()  # neighboring rows of the features are then read one after another
+        self._weights.sort_indices()  # so that rows of the features are read in order
         self._transposed = _int32(csr_array(self._weights.T))
-        # Masks are stacked view by view; where each view's begin, and after the last one the number of masks.
+        # Masks are stacked view by view: where each view's masks begin, and last the number of masks.
         self._first = np.flatnonzero(np.diff(table.mask_view[kept], prepend=-1, append=-2))
         self._size = weight[kept]
 
@@ -167,7 +167,7 @@ class FeatureObjective:
         return _product(*_arrays(self._weights), features, _columns(features)) / self._size[:, None]
 
     def uplift(self, of_masks: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(k, width): the mean of rows of masks, by how much each shows of a Gaussian."""
+        """(k, width): for each Gaussian the mean of the masks' rows, weighted by how much of it each shows."""
         return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
 
     def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
@@ -175,7 +175,7 @@ class FeatureObjective:
         settings, views = self.settings, len(self._first) - 1
         features = np.ascontiguousarray(features)
         means = self.mask_means(features)
-        # Eq. 2 depends on the means alone; pull is the gradient by them.
+        # Eq. 2 depends on the means alone; pull is the gradient with respect to them.
         separation, pull = _separation(means, self._first, closest**2)
         separation, pull = float(separation) / views, pull * (settings.inter / views)
         # Eq. 1 as the difference of the two sums above: one depends on features, one on means.
@@ -193,7 +193,7 @@ class FeatureObjective:
 def _minimise(
     problem: FeatureObjective, raw: NDArray[np.float32], closest: float, tolerance: float, max_steps: int
 ) -> tuple[NDArray[np.float32], list[float], bool]:
-    """Raw features where the objective hardly falls any more, its values on the way, and whether it got there.
+    """Raw features where the objective hardly falls any more, its values on the way, and whether it converged.
 
     Limited-memory BFGS with backtracking, preconditioned by each Gaussian's visible weight.
     """
@@ -210,8 +210,8 @@ def _minimise(
     value, gradient = evaluate(raw)
     values = [value]
     while len(values) <= max_steps:
-        # A Gaussian that shows more has a larger gradient and a larger curvature, both about in proportion to what
-        # shows of it: divided by that, steps are alike for all.
+        # Gradient and curvature of a Gaussian both grow about in proportion to how much of it shows: divided by that,
+        # steps are alike for all.
         step = -gradient / problem.weight
         if pairs:
             step = _two_loops(gradient, pairs, np.float32(1) / problem.weight)
@@ -236,7 +236,7 @@ def _minimise(
 def _backtracked(
     evaluate: Evaluate, raw: NDArray[np.float32], step: NDArray[np.float32], value: float, slope: float
 ) -> tuple[NDArray[np.float32], float, NDArray[np.float32]] | None:
-    """Features, value and gradient after the step, halved until the value falls enough; None where it never does."""
+    """Features, value and gradient after the step, halved until the value falls enough; None if it never does."""
     for halving in range(HALVINGS):
         length = 0.5**halving
         moved = raw + np.float32(length) * step
@@ -251,14 +251,14 @@ def _two_loops(
 ) -> NDArray[np.float32]:
     """Minus the remembered inverse Hessian times the gradient (Nocedal & Wright, Algorithm 7.4).
 
-    There moved is s, turned y, curvature 1 / rho, and shares are alpha.
+    In its symbols, moved is s, turned is y, curvature is 1 / rho, and shares are alpha.
     """
     direction = -gradient
     shares = []
     for moved, turned, curvature in reversed(pairs):
         shares.append(_dot(moved, direction) / curvature)
         direction -= np.float32(shares[-1]) * turned
-    # Where nothing is remembered: the preconditioner, scaled to the curvature along the last step (Eq. 7.20).
+    # For everything not remembered: the preconditioner, scaled to the curvature along the last step (Eq. 7.20).
     _, turned, curvature = pairs[-1]
     direction *= preconditioner * np.float32(curvature / _dot(turned, turned * preconditioner))
     for (moved, turned, curvature), share in zip(pairs, reversed(shares), strict=True):
@@ -269,20 +269,20 @@ def _two_loops(
 def _remember(pairs: list[Pair], moved: NDArray[np.float32], turned: NDArray[np.float32]) -> None:
     """Keep a step and its change of gradient, unless the objective curved downward or hardly at all along it."""
     curvature = _dot(moved, turned)
-    # By the cosine of the two, which has no unit; below 1e-6 it is no more than rounding in float32.
+    # Judged by their cosine, which has no unit; below 1e-6 it is only float32 rounding.
     if curvature > 1e-6 * np.sqrt(_dot(moved, moved) * _dot(turned, turned)):
         pairs.append((moved, turned, curvature))
         del pairs[:-MEMORY]
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Sum of products, in parts that no library spreads over threads: the order is always the same."""
+    """Sum of products, in parts too short for a library to spread over threads: the order is always the same."""
     a, b = a.ravel(), b.ravel()
     return sum(float(a[i : i + DOT_PART] @ b[i : i + DOT_PART]) for i in range(0, len(a), DOT_PART))
 
 
 def _int32(matrix: csr_array) -> csr_array:
-    """The same matrix with indices of one type, whichever scipy chose: kernels are compiled for it once."""
+    """The same matrix with fixed index types, whichever scipy chose: kernels are then compiled once."""
     index = (matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64))
     return csr_array((matrix.data, *index), shape=matrix.shape)
 
@@ -327,7 +327,7 @@ def _read(raw, normalize, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True)
 def _raw_gradient(raw, gradient, normalize, columns):  # noqa: ANN001, ANN202
-    """As `raw_gradient`: the derivative of x / |x| keeps what of the gradient is across x, divided by |x|."""
+    """As `raw_gradient`: the derivative of x / |x| keeps the part of the gradient perpendicular to x, over |x|."""
     pulled = np.empty_like(raw)
     for g in prange(len(raw)):
         square, along = 0.0, 0.0
@@ -346,7 +346,7 @@ def _raw_gradient(raw, gradient, normalize, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _separation(means, first, bound):  # noqa: ANN001, ANN202
-    """Eq. 2 summed over views, 1 / (d^2 + bound), and its gradient by the means (masks, width)."""
+    """Eq. 2 summed over views, 1 / (d^2 + bound), and its gradient with respect to the means (masks, width)."""
     total = 0.0
     gradient = np.zeros_like(means)
     for view in range(len(first) - 1):
@@ -355,14 +355,14 @@ def _separation(means, first, bound):  # noqa: ANN001, ANN202
             continue
         near = np.zeros(count)
         for i in range(begin, begin + count):
-            # 1 / (d_ij^2 + bound) of all others j; a mask with itself is no pair.
+            # 1 / (d_ij^2 + bound) for all other masks j.
             for j in range(begin, begin + count):
                 square = 0.0
                 for c in range(means.shape[1]):
                     square += (means[i, c] - means[j, c]) ** 2
                 near[j - begin] = 1.0 / (square + bound) if j != i else 0.0
-            # Both orders of a pair are summed, as printed, and each moves both means. The derivative by d^2 is
-            # -1 / (d^2 + bound)^2, that of d^2 by a mean twice the difference.
+            # Both orders of a pair are summed, as printed, and each moves both means. Derivative with respect to d^2:
+            # -1 / (d^2 + bound)^2; of d^2 with respect to a mean: twice the difference.
             for j in range(begin, begin + count):
                 part = near[j - begin] * (1.0 / (count * (count - 1)))
                 total += part

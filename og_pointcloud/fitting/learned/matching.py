@@ -1,12 +1,11 @@
-"""Instances + masks -> which masks show which instance (paper, Sec. 3.3, Eq. 5), where no grouping says it already.
+"""Instances + masks -> which masks show which instance (paper, Sec. 3.3, Eq. 5), where no grouping has decided it.
 
     S_ij = IoU(pi(M_i), B_j) * (1 - |M_i - P_j|_1)
 
 M_i is the map of instance i, binarised by pi; B_j is mask j of a view, and P_j that mask filled with its mean feature.
-The paper renders each instance by itself in every view (`alone_evidence`). What an instance shows among the others,
-with true occlusion, is a product with the mask table and needs no rendering at all (`visible_evidence`). Per view the
-mask with the best score is accepted, if that is good enough; the encoder's features of accepted masks describe the
-instance.
+The paper renders each instance alone in every view (`alone_evidence`). What is visible of an instance among the others,
+with true occlusion, is a product with the mask table and needs no rendering (`visible_evidence`). In each view the mask
+with the best score is accepted, if that is good enough; the encoder's features of accepted masks describe the instance.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
 MIXED_VARIANCE = 0.006
-"""A mask whose features vary more (variance, mean of the channels) is no target of Eq. 4, nor accepted by Eq. 5, unless
-it is large (the authors' code)."""
+"""A mask whose features vary more (variance, mean over channels) is neither a target of Eq. 4 nor accepted by Eq. 5,
+unless it is large (the authors' code)."""
 LARGE_SHARE = 0.8
 """A mask with at least this share of the largest mask's pixels is large (the authors' code)."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What Eq. 5 compares, of all masks and K instances. Areas in pixels.
+    """What Eq. 5 compares, for all masks and K instances. Areas in pixels.
 
-    shared: (masks, K) float64, what mask and instance have in common. mask_area: (masks,) float64.
+    shared: (masks, K) float64, the area that mask and instance have in common. mask_area: (masks,) float64.
     instance_area: (views, K) float64. distance: (masks, K) float64, L1 distance of their features, summed over the
     channels; infinite where they have nothing in common.
     """
@@ -47,14 +46,14 @@ class Evidence:
     distance: NDArray[np.float64]
 
     def of_masks(self, kept: NDArray[np.bool_]) -> Evidence:
-        """The same, in which all masks but those kept have nothing in common with any instance."""
+        """The same, except that masks not kept have nothing in common with any instance."""
         distance = np.where(kept[:, None], self.distance, np.inf)
         return replace(self, shared=self.shared * kept[:, None], distance=distance)
 
 
 @dataclass(frozen=True)
 class Matching:
-    """instances: K rows of evidence; an instance that no mask was accepted for has no descriptor, it is unknown.
+    """instances: K rows of evidence; an instance without an accepted mask has no descriptor and is unknown.
     mask_instance: (masks,) int32, the instance that accepted the mask, with the best score where several did, -1 none.
     """
 
@@ -72,14 +71,14 @@ def visible_evidence(
 
     instance_ids: (n,) int32, below 0 none. instance_features: (K, width), one per instance. mask_features:
     (masks, width), the mean instance feature that each mask shows (not the encoder's).
-    A mask's area is what it shows of the cloud: pixels in which it has no point do not count.
+    A mask's area is what it shows of the cloud: pixels that show no point do not count.
     """
     count = len(instance_features)
     shared = weights_by_instance(table.weights, instance_ids, count)
     # What a view shows of an instance lies in its masks or outside all of them.
     instance_area = weights_by_instance(table.outside, instance_ids, count)
     np.add.at(instance_area, table.mask_view, shared)
-    # A channel at a time: differences of all at once would be (masks, K, width).
+    # One channel at a time: all differences at once would be (masks, K, width).
     distance = np.zeros_like(shared)
     for of_masks, of_instances in zip(mask_features.T, instance_features.T, strict=True):
         distance += np.abs(of_masks[:, None].astype(np.float64) - of_instances)
@@ -90,14 +89,14 @@ def visible_evidence(
 def filled_masks(
     image: NDArray[np.floating], mask: NDArray[np.integer], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The mean feature of each mask, P of Eq. 5, (count, width), and whether the mask is of one feature, or large.
+    """The mean feature of each mask, P of Eq. 5, (count, width), and whether its features are uniform or it is large.
 
-    image: (pixels, width) rendered features; mask: (pixels,) the mask of each, 0..count-1. The mean of a mask without a
-    pixel is zero.
+    image: (pixels, width) rendered features; mask: (pixels,) the mask of each, 0..count-1. The mean of a mask without
+    pixels is zero.
     """
     pixels = np.bincount(mask, minlength=count)
     own = csr_array((np.ones(len(mask)), (mask, np.arange(len(mask)))), shape=(count, len(mask)))
-    # The variance about the mean, in a second pass: of squares less the mean's square, rounding would leave little.
+    # The variance about the mean, in a second pass: mean square less squared mean would be mostly rounding.
     means = (own @ image) / np.maximum(pixels, 1)[:, None]
     variance = np.mean(np.asarray(own @ (image - means[mask]) ** 2), axis=1) / np.maximum(pixels, 1)
     pure = (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max(initial=0))
@@ -107,12 +106,12 @@ def filled_masks(
 def rendered_masks(
     gaussians: Gaussians, views: Sequence[View], near: float, features: NDArray[np.float32], covered_share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`filled_masks` of all views, (masks, width) and (masks,), from pixels that are covered by ``covered_share``."""
+    """`filled_masks` of all views, (masks, width) and (masks,), from pixels covered by at least ``covered_share``."""
     found = []
     for view in views:
         image, alpha = render(gaussians, features, view.camera, near)
         ids = view.mask_map()
-        # A pixel that is covered less shows a feature too small by that much.
+        # In a pixel that is covered less, the feature is too small by that much.
         inside = (ids >= 0) & (alpha >= covered_share)
         found.append(filled_masks(image[inside], ids[inside], view.mask_count))
     means, pure = zip(*found, strict=True)
@@ -128,14 +127,14 @@ def alone_evidence(
     mask_features: NDArray[np.floating],
     covered_share: float,
 ) -> Evidence:
-    """The paper's evidence: each instance rendered by itself in every view, as if nothing stood before it.
+    """The paper's evidence: each instance rendered alone in every view, as if nothing were in front of it.
 
-    An instance's pixels are those it covers by more than ``covered_share`` (pi); the distance is the mean over those of
-    them that lie in the mask. Instances without a Gaussian in the image are not rendered.
+    An instance's pixels are those it covers by more than ``covered_share`` (pi); the distance is the mean over those
+    that lie in the mask. Instances without a Gaussian in the image are not rendered.
     One rendering per instance and view: slow. near: depth of the near plane; the rest as in `visible_evidence`.
     """
     count = len(instance_features)
-    # Masks of all views are numbered one after another; here each view's begin.
+    # Masks of all views are numbered consecutively: where each view's masks begin.
     first = np.cumsum([0, *(view.mask_count for view in views)])
     shared = np.zeros((first[-1], count))
     distance = np.full((first[-1], count), np.inf)
@@ -149,7 +148,7 @@ def alone_evidence(
         for instance, own in enumerate(members):
             if not _in_image(own, view.camera, near):
                 continue
-            # All Gaussians of an instance have its one feature, so its map is that times the coverage: no channels.
+            # An instance's Gaussians share one feature, so its map is that times the coverage: no channels to render.
             alpha = render(own, np.zeros((len(own), 0), np.float32), view.camera, near)[1].ravel().astype(np.float64)
             covered = alpha > covered_share
             instance_area[index, instance] = covered.sum()
@@ -166,7 +165,7 @@ def alone_evidence(
 
 def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: MatchingSettings) -> NDArray[np.float64]:
     """(masks, K) float64 in [0, 1]: S_ij of Eq. 5, or one of its factors alone."""
-    # The distance sums over channels, and is infinite without a common pixel: as printed, scores would be negative.
+    # The distance is summed over channels, and infinite without a common pixel: as printed, scores would be negative.
     area, likeness = evidence.instance_area[mask_view], np.maximum(1 - evidence.distance, 0)
     if settings.score == "feature":
         return likeness
@@ -178,11 +177,11 @@ def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: Match
 def match_masks(
     table: MaskTable, instance_ids: NDArray[np.int32], evidence: Evidence, settings: MatchingSettings
 ) -> Matching:
-    """Accept masks for instances and describe these by what the encoder saw in their masks.
+    """Accept masks for instances, and describe each instance by the encoder's features of its masks.
 
-    In every view an instance takes the mask with its best score, if that exceeds the threshold; where fewer than
-    ``min_views`` do, it takes none at all. Its descriptor is the mean direction of its masks' features, each of the
-    same weight. Masks without a feature (zero rows) are evidence, but in no descriptor.
+    In every view an instance takes its best-scoring mask, if that score exceeds the threshold; with fewer than
+    ``min_views`` such views it takes none at all. Its descriptor is the mean direction of its masks' features, equally
+    weighted. Masks without a feature (zero rows) are evidence, but in no descriptor.
     """
     scores = eq5_scores(evidence, table.mask_view, settings)
     masks, owners = _accepted(scores, table.mask_view, settings)
@@ -191,21 +190,21 @@ def match_masks(
     features = directions(table.mask_features)
     total = np.zeros((count, features.shape[1]))
     np.add.at(total, owners, features[masks])
-    described = np.flatnonzero(np.linalg.norm(total, axis=1) > 1e-12)  # opposite features may cancel
-    # Agreement: the mean cosine of an instance's masks with its descriptor, of those that have a feature.
+    described = np.flatnonzero(np.linalg.norm(total, axis=1) > 1e-12)  # opposite features can cancel
+    # Agreement: the mean cosine between an instance's descriptor and its masks, of those that have a feature.
     with_feature = np.bincount(owners[features[masks].any(axis=1)], minlength=count)
     cosines = np.bincount(owners, (features[masks] * directions(total)[owners]).sum(axis=1), count)
     instances = InstanceTable(
         descriptors=directions(total[described]).astype(np.float32),
         descriptor_instance=described.astype(np.int32),
         points=np.bincount(instance_ids[instance_ids >= 0], minlength=count).astype(np.int32),
-        views=accepted,  # at most one mask of each
+        views=accepted,  # at most one mask of each view
         masks=accepted.copy(),
         agreement=(cosines / np.maximum(with_feature, 1)).astype(np.float32),
         visible_area=np.bincount(owners, evidence.shared[masks, owners], count).astype(np.float32),
     )
     owner = np.full(len(scores), -1, np.int32)
-    by_score = np.argsort(scores[masks, owners], kind="stable")  # of several writes the last stays: the best
+    by_score = np.argsort(scores[masks, owners], kind="stable")  # the last write wins: the best score
     owner[masks[by_score]] = owners[by_score]
     return Matching(instances, owner)
 
@@ -222,7 +221,7 @@ def _accepted(
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     masks = np.stack(best, axis=1)  # (K, views that have masks)
     reached = np.take_along_axis(scores.T, masks, axis=1)
-    # A relative threshold counts in best scores: what the scene's typical instance reaches in its best view.
+    # A relative threshold is a factor on what the scene's typical instance scores in its best view.
     best_of_instance = reached.max(axis=1)
     unit = np.median(best_of_instance[best_of_instance > 0]) if settings.relative and best_of_instance.any() else 1.0
     good = reached > settings.threshold * unit
@@ -231,7 +230,7 @@ def _accepted(
 
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
-    """Whether any center lies before the camera and in the image, or within the margin from which splats reach in."""
+    """Whether any center lies in front of the camera and in the image, or in the margin from which splats reach in."""
     uv_px, depth = camera.project(gaussians.xyz)
     size = np.array([camera.width, camera.height])
     # From the middle: half the image, and the share of that half by which the projection goes beyond.

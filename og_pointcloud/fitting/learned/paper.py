@@ -1,23 +1,24 @@
 """OpenGaussian as published (paper, Sec. 3.1 and 3.2): features and codebook trained by rendering, one view a step.
 
-The reference for the fast forms (instance_features.py, codebook.py), in error and in time. A step draws a view, renders
-the feature map ``M = W F`` with the view's frozen blending weights, takes the losses on its pixels, and lets Adam move
-all features. ``formula`` chooses between the printed equations and what the authors' code computes:
+The reference for the fast forms (instance_features.py, codebook.py), in error and in time. A step picks a random view,
+renders the feature map ``M = W F`` with its frozen blending weights, computes the losses on its pixels, and updates all
+features with Adam. ``formula`` chooses between the printed equations and what the authors' code computes:
 
-    Eq. 1    paper: squares summed over the pixels of all masks, divided by the pixels in a view's masks on average.
+    Eq. 1    paper: squares summed over the pixels of all masks, divided by the mean number of masked pixels per view.
              authors: distances not squared, mean over a mask's pixels, then over masks.
     Eq. 2    paper: mean of 1 / d^2. authors: 1 / (d^2 + 1), each row weighted 0.1 to 1 by rank of nearness; after
              LATE_STEP only the nearest tenth keeps its weight, the others the least.
     Eq. 4    paper: L1 between the map of cluster centers and that of the features of stage 1, over the image.
              authors: the target is each mask's mean painted back, L1 in the coarse stage, squares in the fine one;
              masks of mixed features are left out, here and in the association; in some steps all Gaussians are drawn
-             smaller, so that hidden ones show and features become right per point, not only per blend; the fine stage
-             draws one coarse cluster a step, by itself.
-    Eq. 3    paper: clusters of features as read. authors: of the raw vectors, whose length positions compare with.
+             smaller, so that hidden ones show and features become right per point, not only per blend; each step of
+             the fine stage draws one coarse cluster alone.
+    Eq. 3    paper: clusters of features as read. authors: of the raw vectors, so that position counts relative to
+             their length.
 
-docs/paper.md has all numbers of both beside ours. Defects of the published code are mended: centers follow their
+docs/paper.md lists all numbers of both beside ours. Defects of the published code are fixed: centers follow their
 clusters at every step, not only when points are reassigned; fine centers start inside their coarse cluster, and empty
-ones start again elsewhere in it; pixels without a mask are no target; points that no mask shows get no cluster.
+ones restart elsewhere in it; pixels without a mask are not targets; points that no mask shows get no cluster.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ with naming_extra("torch", "learn"):
     import torch
 
 STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
-"""Steps of the features, the coarse and the fine codebook (the authors' code; the sums are the paper's)."""
+"""Steps of the features, the coarse and the fine codebook stage (the authors' code; the sums are the paper's)."""
 LATE_STEP = 5_000
-"""From this step on, times schedule_share, the authors' Eq. 2 is about the nearest pairs."""
+"""From this step on, times schedule_share, the authors' Eq. 2 concentrates on the nearest pairs."""
 LEAST_WEIGHT = 0.1
 """Weight of a mask's farthest pair in the authors' Eq. 2; the nearest weighs 1."""
 LATE_RANK = 0.9
@@ -54,20 +55,20 @@ LATE_RANK = 0.9
 SMALLEST_DISTANCE = 1e-4
 """Added in quadrature to the distances of the printed Eq. 2: two equal means would give infinity."""
 ROUNDING = 1e-3
-"""Where distances are not squared, their cone is rounded off at this radius: sqrt(d^2 + ROUNDING^2)."""
+"""Distances that are not squared are smoothed at zero by this radius: sqrt(d^2 + ROUNDING^2)."""
 ADAM_EPSILON = 1e-15
-"""As in 3DGS: one Gaussian's share of the gradient of a mean over pixels is small beside the usual 1e-8."""
+"""As in 3DGS: one Gaussian's share of the gradient of a mean over pixels is small compared with the usual 1e-8."""
 OWN_MASK_SHARE = 0.2
 """A coarse cluster holds a mask when it has more than this share of the mask's blended weight."""
 SIZES = 8
-"""Smaller Gaussians are drawn in one of so many sizes, evenly spread over 0 to 1 (the authors: any size): few enough
-that the weights of each can be kept."""
+"""Shrunken Gaussians have one of this many sizes, evenly spread over 0 to 1 (the authors: any size): few enough for the
+weights of each to be kept."""
 CURVE_POINTS = 200
-"""Points of a stage's curve of losses in the provenance."""
+"""Points of a stage's loss curve in the provenance."""
 RECENT = 100
-"""The loss that is reported is the mean of the last so many steps: each sees another view."""
+"""The reported loss is the mean over this many last steps, since each sees another view."""
 CHECKPOINT_SECONDS = 60.0
-"""The state of the training is written to the work folder this often."""
+"""The training state is written to the work folder this often."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +76,8 @@ class TrainingRun:
     """How the stages run. seed: of the start and of the views drawn.
 
     progress: called after every step with the stage's name, the step's number, the number of steps, and the mean of the
-    last losses. work: keeps checkpoints. A training that was killed and is started again with the same folder, scene,
-    settings and seed continues from the last one, and ends with the same bits as if nothing had happened. None: nothing
-    is kept.
+    last losses. work: keeps checkpoints. Training that was killed and restarted with the same folder, scene, settings
+    and seed continues from the last one, and ends bit-identical to an uninterrupted run. None: nothing is kept.
     """
 
     seed: int = 0
@@ -88,7 +88,7 @@ class TrainingRun:
 @dataclass
 class StageHistory:
     """A stage's cost and losses. published_steps: steps at schedule_share 1. seconds: of all steps done. loss: one
-    number per step done. resumed_at: the step that an earlier run had got to, 0 where there was none."""
+    number per step done. resumed_at: the step that an earlier run had reached, 0 if there was none."""
 
     name: str
     published_steps: int
@@ -103,7 +103,7 @@ class StageHistory:
 
     @property
     def published_seconds(self) -> float:
-        """What the stage would take at its published number of steps."""
+        """Seconds that the stage would take at its published number of steps."""
         return self.published_steps * self.seconds / max(self.steps, 1)
 
     def to_dict(self) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class TrainedCodebook:
 
 
 def train_features(source: RenderedViews, settings: PaperSettings, run: TrainingRun | None = None) -> TrainedFeatures:
-    """Stage 1: features of all Gaussians from random ones in [0, 1], by Eq. 1 and 2 of one random view a step.
+    """Stage 1: features of all Gaussians, from random ones in [0, 1], by Eq. 1 and 2 of one random view per step.
 
     source: only the pixels in masks.
     """
@@ -158,7 +158,7 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
         view = source[int(rng.integers(len(source)))]
         image = view.render(_read(trained, settings.normalize))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
-        # The printed Eq. 1 is a sum over pixels: its weight is to mean the same at any image size.
+        # The printed Eq. 1 is a sum over pixels: scaled so that its weight means the same at any image size.
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
         loss = settings.inter * separation + settings.intra * settings.cohesion_weight * scale * cohesion
         stage.adam.zero_grad(set_to_none=True)
@@ -178,7 +178,7 @@ def view_losses(
     int64, their masks 0..m-1, each at least once. Eq. 1 of formula "paper" is the sum over pixels, as printed."""
     pixels = torch.bincount(mask)
     means = _mask_means(image, mask, pixels)
-    square = (image - means.index_select(0, mask)).square().sum(dim=1)  # indexing has a far slower gradient
+    square = (image - means.index_select(0, mask)).square().sum(dim=1)  # indexing has a much slower gradient
     if settings.formula == "authors":
         distance = (square + ROUNDING**2).sqrt()  # the distance itself has no gradient at zero
         cohesion = _mask_means(distance[:, None], mask, pixels).mean()
@@ -188,7 +188,7 @@ def view_losses(
 
 
 def _mask_means(values: torch.Tensor, mask: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """(masks, width) means of values (pixels, width). pixels: (masks,) how many each mask has."""
+    """(masks, width) means of values (pixels, width). pixels: (masks,) the number in each mask."""
     return values.new_zeros((len(pixels), values.shape[1])).index_add(0, mask, values) / pixels[:, None]
 
 
@@ -196,12 +196,12 @@ def _separation(means: torch.Tensor, formula: str, late: bool) -> torch.Tensor:
     """Eq. 2 of one view from the means of its masks (m, width)."""
     m = len(means)
     if m < 2:
-        return means.sum() * 0  # not a plain 0: it is differentiated
+        return means.sum() * 0  # not a plain 0, which has no gradient
     square = (means[:, None] - means[None]).square().sum(dim=2)
     near = 1 / (square + (1.0 if formula == "authors" else SMALLEST_DISTANCE**2))
     near = near * (1 - torch.eye(m, dtype=means.dtype, device=means.device))
     if formula == "authors":
-        # Rank of nearness within a row, by argsort twice: a mask itself has 0, the farthest other 1, the nearest m - 1.
+        # Rank of nearness within a row, by two argsorts: the mask itself 0, the farthest other 1, the nearest m - 1.
         rank = near.detach().argsort(dim=1, stable=True).argsort(dim=1).to(means.dtype)
         weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (m - 1)
         if late:
@@ -216,8 +216,8 @@ def train_codebook(
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
     source: all pixels with formula "paper", else only those in masks. raw: (n, width), of stage 1, not yet read. A step
-    renders cluster centers in place of features, takes Eq. 4, and moves each feature by the gradient of its center (a
-    straight-through estimate). Positions count in scene units, as published.
+    renders cluster centers in place of features, computes Eq. 4, and moves each feature by the gradient at its center
+    (straight-through estimator). Positions are in scene units, as published.
     """
     run = run or TrainingRun()
     rng = np.random.default_rng(run.seed)
@@ -236,7 +236,7 @@ def train_codebook(
     together = _Parts([np.arange(len(known))], [len(centers)], places)
     own, _ = training.train(coarse, centers, together, run, key)
 
-    # Fine: each coarse cluster is a part of its own, clustered by features alone from some of its own Gaussians.
+    # Fine: each coarse cluster is a separate part, clustered by features alone from some of its own Gaussians.
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centers))]
     held = _masks_held(source, own, len(centers))
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
@@ -255,11 +255,11 @@ def train_codebook(
 
 @dataclass(frozen=True)
 class _Parts:
-    """Parts of the known Gaussians that are clustered each by itself.
+    """Parts of the known Gaussians that are clustered separately.
 
-    rows, counts: of each part, its rows of the known Gaussians and its number of clusters. places: (known, 3 or 0),
-    clustered with the features but not rendered. held: of each view (masks, parts) bool, the masks that a part holds;
-    None in the coarse stage, whose one part is never drawn by itself.
+    rows, counts: for each part, its rows of the known Gaussians and its number of clusters. places: (known, 3 or 0),
+    clustered with the features but not rendered. held: for each view (masks, parts) bool, the masks that a part holds;
+    None in the coarse stage, whose only part is never drawn alone.
     """
 
     rows: list[NDArray[np.int64]]
@@ -270,8 +270,8 @@ class _Parts:
     def reassigned(
         self, features: NDArray[np.float32], centers: NDArray[np.float32], rounds: int
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Every point's nearest center of its part after a few rounds of Lloyd's algorithm, and the centers."""
-        # Centers of all parts stand in one array, part by part; ``first`` is where a part's begin.
+        """Every point's nearest center in its part after some rounds of Lloyd's algorithm, and the centers."""
+        # Centers of all parts are in one array, part by part; ``first`` is where a part's centers begin.
         values = np.concatenate([features, self.places], axis=1)
         own, centers, first = np.zeros(len(values), np.int64), centers.copy(), 0
         for rows, count in zip(self.rows, self.counts, strict=True):
@@ -284,25 +284,25 @@ class _Parts:
 
 
 class _CodebookTraining:
-    """Features that move behind their cluster centers; both codebook stages are runs of it."""
+    """Trains features through their cluster centers; both codebook stages use it."""
 
     def __init__(self, source: RenderedViews, raw: torch.Tensor, settings: PaperSettings) -> None:
         self.source, self.settings = source, settings
-        # What stage 1 shows is the target of Eq. 4 (the paper's pseudo features): it never changes.
+        # The target of Eq. 4 is rendered from the features of stage 1 (the paper's pseudo features): it never changes.
         self.pseudo = _read(raw, settings.normalize)
-        # Clusters of raw vectors have raw centers, which are read when they are rendered; else all is read once, here.
+        # Clusters of raw vectors have raw centers, which are read at each rendering; else all are read once, here.
         self.reads_centers = settings.normalize and settings.cluster_raw
         self.features = raw if self.reads_centers else self.pseudo.clone()
-        self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # by view, as they are asked for
+        self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # by view, made when needed
 
     def read(self, values: torch.Tensor) -> torch.Tensor:
-        """What is rendered of features or centers."""
+        """Features or centers as they are rendered."""
         return _read(values, self.reads_centers)
 
     def train(
         self, history: StageHistory, centers: NDArray[np.float32], parts: _Parts, run: TrainingRun, key: str
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Train until the stage's steps are done; own center of each known Gaussian and the centers (k, width)."""
+        """Train until the stage's steps are done; the center of each known Gaussian, and the centers (k, width)."""
         settings, features, width = self.settings, self.features, self.features.shape[1]
         is_fine = parts.held is not None
         interval = settings.fine_interval if is_fine else settings.coarse_interval
@@ -314,7 +314,7 @@ class _CodebookTraining:
                 stage.reassign(parts, settings.lloyd_rounds)
             view, target, rows = self._draw(rng, parts)
             quantized = stage.centers[:, :width][stage.own].requires_grad_()
-            # Eq. 4, and its gradient by the centers given to the features: straight through.
+            # Eq. 4; its gradient with respect to the centers is passed straight through to the features.
             error = view.render(self.read(quantized))[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantized)
@@ -328,7 +328,7 @@ class _CodebookTraining:
 
     def _draw(self, rng: np.random.Generator, parts: _Parts) -> tuple[RenderedView, torch.Tensor, torch.Tensor | slice]:
         """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which of
-        its pixels are asked."""
+        its pixels count."""
         index = int(rng.integers(len(self.source)))
         view = self.source[index]
         if self.settings.formula == "paper":
@@ -347,9 +347,9 @@ class _CodebookTraining:
             part = int(choices[rng.integers(len(choices))])
             members, kept = parts.rows[part], kept & torch.tensor(parts.held[index][:, part], device=kept.device)
         drawn = self.source.drawn(index, factor, part, members)
-        # Of the masks of the full view, the one that each pixel drawn is in: fewer masks may be left.
+        # The mask of the full view that each drawn pixel is in: the drawn view may have fewer masks.
         place = torch.searchsorted(view.mask_names, drawn.mask_names)[drawn.mask]
-        if not kept[place].any():  # too little is left to cover a pixel of a target
+        if not kept[place].any():  # no pixel of a target is covered any more
             drawn, place, kept = view, view.mask, self.targets[index][1]
         rows = kept[place]
         return drawn, means[place][rows], rows
@@ -363,7 +363,7 @@ def _cluster_means(features: torch.Tensor, own: torch.Tensor, centers: torch.Ten
 
 
 def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[NDArray[np.bool_]]:
-    """Of each view (masks, k1): the masks that each coarse cluster holds."""
+    """For each view (masks, k1) bool: the masks that each coarse cluster holds."""
     held = []
     for view in source:
         of_masks = csr_array(indicator(_on_host(view.mask), len(view.mask_names)) @ view.weights)
@@ -372,19 +372,19 @@ def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[
 
 
 def _fine_counts(held: list[NDArray[np.bool_]], settings: PaperSettings) -> list[int]:
-    """Fine clusters of each coarse one: k2; by formula "authors" at most one more than it holds masks of any view."""
+    """Fine clusters of each coarse one: k2; by formula "authors" at most one more than the masks it holds in a view."""
     most = np.max([of_view.sum(axis=0) for of_view in held], axis=0)
     return [settings.k2 if settings.formula == "paper" else int(min(count + 1, settings.k2)) for count in most]
 
 
 class _Read(torch.autograd.Function):
-    """Directions mapped to [0, 1] (`instance_features.read_features`). torch's own gradient of it would take most of a
-    step's time."""
+    """Directions mapped to [0, 1] (`instance_features.read_features`). torch's own gradient would take most of the time
+    of a step."""
 
     @staticmethod
     def forward(ctx: Any, raw: torch.Tensor) -> torch.Tensor:
         length = raw.norm(dim=1, keepdim=True)
-        length.masked_fill_(length == 0, torch.inf)  # a zero row reads 0.5, and nothing pulls at it
+        length.masked_fill_(length == 0, torch.inf)  # a zero row reads 0.5, with zero gradient
         direction = raw / length
         ctx.save_for_backward(direction, length)
         return torch.add(0.5, direction, alpha=0.5)
@@ -392,7 +392,7 @@ class _Read(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:  # pyright: ignore
         direction, length = ctx.saved_tensors
-        # The derivative of x / |x| keeps what of the gradient is across x, divided by |x|.
+        # The derivative of x / |x| keeps the part of the gradient perpendicular to x, divided by |x|.
         along = (direction * gradient).sum(dim=1, keepdim=True)
         return torch.addcmul(gradient, direction, along, value=-1).mul_(0.5 / length)
 
@@ -403,12 +403,12 @@ def _read(raw: torch.Tensor, normalize: bool) -> torch.Tensor:
 
 
 def _on_host(values: torch.Tensor) -> NDArray[Any]:
-    """The values in numpy; on a CPU the same memory."""
+    """The values in numpy; on a CPU they share memory."""
     return values.detach().cpu().numpy()
 
 
 def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingRun, *more: Any) -> str:
-    """A fingerprint of all that the outcome of a stage depends on; empty where nothing is kept."""
+    """A fingerprint of everything that the result of a stage depends on; empty where nothing is kept."""
     if run.work is None:
         return ""
     drawn = source.gaussians
@@ -418,10 +418,10 @@ def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingR
 
 
 class _Stage:
-    """All that a stage of training changes, and so all that a checkpoint holds.
+    """Everything that a training stage changes, and therefore everything in a checkpoint.
 
-    features: (known, width) float32, moved in place by ``adam``. centers, own: of a codebook stage, (k, d) float32 and
-    (known,) int64, the row of centers that each Gaussian has, on the features' device.
+    features: (known, width) float32, updated in place by ``adam``. centers, own: in a codebook stage, (k, d) float32
+    and (known,) int64, each Gaussian's row of centers, on the features' device.
     """
 
     def __init__(
@@ -434,15 +434,15 @@ class _Stage:
         self.own = torch.zeros(len(features), dtype=torch.int64, device=features.device)
 
     def reassign(self, parts: _Parts, rounds: int) -> None:
-        """Own centers anew, by `_Parts.reassigned`, on the host."""
+        """Reassign Gaussians to centers by `_Parts.reassigned`, on the host."""
         own, centers = parts.reassigned(_on_host(self.features), _on_host(self.centers), rounds)
         device = self.features.device
         self.own, self.centers = torch.as_tensor(own, device=device), torch.as_tensor(centers, device=device)
 
     def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
-        """The numbers of the steps that are left, each with random numbers of its own: seeded by step and stage, they
-        are the same whether or not this run did the steps before. Times and reports each step, and keeps the state
-        under the key now and then."""
+        """The numbers of the remaining steps, each with its own random generator: seeded by step and stage, so that it
+        does not matter whether this run did the steps before. Times and reports each step, and saves the state under
+        the key now and then."""
         history = self.history
         count = max(1, round(history.published_steps * settings.schedule_share))
         name, kept_at = history.name.replace(" ", "-"), time.monotonic()
@@ -467,7 +467,7 @@ class _Stage:
         return *(_on_host(tensor).copy() for tensor in (features, *moments, self.centers, self.own)), losses
 
     def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
-        """Go on from a checkpoint (`_arrays`). Adam's count of steps is the number of losses."""
+        """Continue from a checkpoint (`_arrays`). Adam's step count is the number of losses."""
         *tensors, losses = arrays
         device = self.features.device
         features, average, square, self.centers, self.own = (torch.tensor(array, device=device) for array in tensors)

@@ -1,8 +1,8 @@
 """Blending weights of the views that mode paper trains on: geometry is frozen, so each view is composited once.
 
-A pixel shows ``M = W F``, and a step of training is two products, ``W F`` and ``W' G`` of the gradient, on the device
-that the settings name. Weights are kept as far as memory goes; those of other views are composited anew at every use,
-with the same bits. Gaussians that no mask shows have no column: they get neither feature nor cluster, and show nothing.
+A pixel shows ``M = W F``, and a training step is two products, ``W F`` and, for the gradient, ``W' G``, on the device
+given in the settings. Weights are kept as far as memory allows; those of other views are composited anew at every use,
+bit-identical. Gaussians that no mask shows have no column: they get neither feature nor cluster, and show nothing.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class RenderedView:
     """One view's blending weights.
 
     weights: (pixels, known) CSR float32 with int32 indices, a pixel's nearest Gaussian first. mask: (pixels,) int64, a
-    row of mask_names, -1 outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. Both tensors lie on
-    the device that values are rendered on. pixels: (pixels,) places in the image, row by row.
+    row of mask_names, -1 outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. Both tensors are on
+    the device that values are rendered on. pixels: (pixels,) indices into the image, row by row.
     """
 
     weights: csr_array
@@ -46,25 +46,25 @@ class RenderedView:
 
     @cached_property
     def _factors(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """W and W' in torch. Both are kept: torch's own gradient of a CSR product takes a hundred times longer."""
+        """W and W' in torch. Both are kept: torch's own gradient of a CSR product is a hundred times slower."""
         both = (self.weights, csr_array(self.weights.T.tocsr()))
         return tuple(_in_torch(weights, self.mask.device) for weights in both)  # pyright: ignore
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it holds in memory, W' too."""
-        # An entry: index and value of 4 bytes each, in W and in W'. A pixel: start of its row 4, mask 8, place 8.
+        """Bytes in memory, including W'."""
+        # Per entry: index and value of 4 bytes each, in W and in W'. Per pixel: row start 4, mask 8, place 8.
         return 16 * self.weights.nnz + 20 * len(self.mask)
 
 
 class RenderedViews:
-    """Blending weights of all views that have a mask, kept as far as ``cache_bytes`` go, else composited anew.
+    """Blending weights of all views that have a mask, kept as far as ``cache_bytes`` allow, else composited anew.
 
-    views: thinned to the resolution that is to be rendered. near: depth of the near plane, scene units. whole: with all
-    pixels, else those in masks that are covered enough. Raises SceneError where no mask has a pixel covered enough.
+    views: thinned to the resolution to render at. near: depth of the near plane, scene units. whole: with all pixels,
+    else those in masks that are covered enough. Raises SceneError if no mask has a pixel covered enough.
 
-    seen: (n,) blending weight in masks. known: rows of the Gaussians that have any. masked_pixels: pixels in masks of a
-    view, on average. device: of the views' tensors.
+    seen: (n,) blending weight in masks. known: rows of the Gaussians that have any. masked_pixels: mean number of
+    masked pixels per view. device: of the views' tensors.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class RenderedViews:
         self.views: list[View] = []
         self._kept: dict[tuple[int, float, int], RenderedView] = {}
         self._room = settings.cache_bytes
-        # Which Gaussians masks show is known after all views: until then each has a column.
+        # Which Gaussians masks show is known only after all views: until then each has a column.
         self._column = np.arange(len(gaussians), dtype=np.int32)
         pixels = 0
         for view in views:
@@ -112,8 +112,8 @@ class RenderedViews:
         """A view with all Gaussians' standard deviations times ``factor``, and only these ``members`` (rows of the
         known Gaussians; None: all); its masks are among those at full size.
 
-        cluster: at least 0, names the members: the view is kept under this number, so the same number must always come
-        with the same members.
+        cluster: at least 0, a number for the members: the view is cached under it, so the same number must always mean
+        the same members.
         """
         key = index, factor, cluster
         if key in self._kept:
@@ -123,7 +123,7 @@ class RenderedViews:
         if factor != 1.0:
             gaussians = replace(gaussians, scale=(gaussians.scale * np.float32(factor)).astype(np.float32))
         full = key == (index, 1.0, -1)
-        # Targets are made at full size: a mask that shows only when Gaussians are smaller has none.
+        # Targets are made at full size: a mask that shows only when Gaussians are smaller has no target.
         masks = None if full else self[index].mask_names.cpu().numpy()
         column = self._column if rows is None else self._column[rows]
         rendered = self._composited(gaussians, self.views[index], column, masks)
@@ -138,11 +138,11 @@ class RenderedViews:
     def _composited(
         self, gaussians: Gaussians, view: View, column: NDArray[np.int32], masks: NDArray[np.int64] | None = None
     ) -> RenderedView:
-        """The view's weights. column: (Gaussians,) of the result, -1 none; masks: only these count, all by default."""
+        """The view's weights. column: (Gaussians,) in the result, -1 none; masks: only these count, all by default."""
         ids = np.maximum(view.mask_map().ravel(), -1)
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
-        # Every wanted pixel is an id of its own; the last row, of all other pixels, is dropped.
+        # Every wanted pixel has its own id; the last row, for all other pixels, is dropped.
         wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
         number = np.full(len(ids), -1, np.int32)
         number[wanted] = np.arange(len(wanted))
@@ -153,7 +153,7 @@ class RenderedViews:
         inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
         rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
         ids = np.where(inside, ids, -1)[rows]
-        # Masks that are left, numbered without gaps: means over them are never of no pixel.
+        # Remaining masks, numbered without gaps, so that each has a pixel to average over.
         names = np.unique(ids[ids >= 0]).astype(np.int64)
         mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
         small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
@@ -162,7 +162,7 @@ class RenderedViews:
 
 
 def device_of(name: str) -> torch.device:
-    """Where to train: a name of torch's, or "auto", the first GPU of CUDA there is. OgPointcloudError for others."""
+    """Where to train: a torch device, or "auto": the first CUDA GPU, else the CPU. OgPointcloudError for others."""
     gpus = [f"cuda:{index}" for index in range(torch.cuda.device_count())]
     known = {"cpu": "cpu", "auto": gpus[0] if gpus else "cpu"} | {gpu: gpu for gpu in gpus}
     known |= {"cuda": gpus[0]} if gpus else {}
@@ -174,26 +174,26 @@ def device_of(name: str) -> torch.device:
 
 
 def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> csr_array:
-    """The weights in other columns, of ``count``; entries whose new column is -1 are left out."""
+    """The weights moved to other columns, ``count`` in all; entries whose new column is -1 are dropped."""
     indices, indptr, data = column[weights.indices], weights.indptr, weights.data
     if (indices < 0).any():
         kept = indices >= 0
-        # A row now begins after as many entries as are kept of those before it.
+        # A row begins after the entries kept in the rows before it.
         indptr = np.concatenate([[0], np.cumsum(kept)])[indptr]
         indices, data = indices[kept], data[kept]
     return csr_array((data, indices, indptr.astype(np.int32)), shape=(weights.shape[0], count))
 
 
 def _in_torch(weights: csr_array, device: torch.device) -> torch.Tensor:
-    """The same matrix, and on a CPU the same memory."""
+    """The same matrix; on a CPU it shares memory."""
     parts = (torch.as_tensor(part, device=device) for part in (weights.indptr, weights.indices, weights.data))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch calls its CSR tensors a beta
+        warnings.simplefilter("ignore")  # torch warns that its CSR tensors are beta
         return torch.sparse_csr_tensor(*parts, size=weights.shape, device=device, check_invariants=False)
 
 
 class _Blend(torch.autograd.Function):
-    """W F with the gradient W' G. float64 values, as the tests have them, are blended in float64."""
+    """W F with the gradient W' G. float64 values, as in the tests, are blended in float64."""
 
     @staticmethod
     def forward(ctx: Any, values: torch.Tensor, weights: torch.Tensor, transposed: torch.Tensor) -> torch.Tensor:
