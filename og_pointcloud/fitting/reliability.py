@@ -14,7 +14,7 @@ already. The reliability of an instance is the product of three shares in [0, 1]
 
 Instances have the same look if their descriptors are alike after what all masks have in common is removed: two chairs
 do, and either may be found in place of the other. No half can reveal an error that all views share. Over
-`examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
+`examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/scores.md has the figures.
 """
 
 from __future__ import annotations
