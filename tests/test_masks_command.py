@@ -126,13 +126,13 @@ SLOWLY = """
 import sys, time
 from og_pointcloud.masking import worker as w
 from og_pointcloud.masking import make_masks as m
-settled = w.settled
+masks_of_level = w.masks_of_level
 def slow(*arguments):
     with open(sys.argv[2], "a") as log:
         log.write("x")
     time.sleep(float(sys.argv[3]))
-    return settled(*arguments)
-w.settled = slow
+    return masks_of_level(*arguments)
+w.masks_of_level = slow
 m.make_masks(sys.argv[1], m.MaskSettings(encoder=None))
 """
 
