@@ -46,7 +46,7 @@ class FeatureSpace:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise FeatureSpaceError(
-                f"the feature space is {self.name!r:.80}; expected the encoder's name, '{UNKNOWN_SPACE}' if not known"
+                f"the feature space is {self.name!r:.80}; expected the encoder's name, or '{UNKNOWN_SPACE}'"
             )
 
     def accepts(self, other: FeatureSpace) -> bool:
@@ -58,10 +58,10 @@ class FeatureSpace:
     def require(self, other: FeatureSpace, what: str) -> None:
         """FeatureSpaceError unless the two can be compared; it calls the other space's vectors ``what``."""
         if not self.accepts(other):
-            raise FeatureSpaceError(f"the {what} are of {other}; expected {self}: encode them with that encoder")
+            raise FeatureSpaceError(f"the {what} are in {other}; expected {self}: encode them with that encoder")
 
     def __str__(self) -> str:
-        return f"feature space '{self.name}'" + (f" (width {self.width})" if self.width else "")
+        return f"feature space '{self.name}'" + (f" (dimension {self.width})" if self.width else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class InstanceTable:
         if owner.size and (owner.min() < 0 or owner.max() >= count or (np.diff(owner) < 0).any()):
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
         if not np.isfinite(self.descriptors).all():
-            raise OgPointcloudError("descriptors hold NaN or infinity; expected unit rows")
+            raise OgPointcloudError("descriptors contain NaN or infinity; expected unit rows")
         _check_hierarchy(self.coarse, self.part_of)
 
     def __len__(self) -> int:
@@ -163,8 +163,8 @@ def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> N
     count = len(part_of)
     if count and (coarse.min() < -1 or part_of.min() < -1 or part_of.max() >= count):
         raise OgPointcloudError(
-            f"coarse clusters reach down to {coarse.min()}, part_of spans {part_of.min()}..{part_of.max()}; expected "
-            f"-1 or a number from 0, part_of at most {count - 1}"
+            f"coarse clusters start at {coarse.min()}, part_of spans {part_of.min()}..{part_of.max()}; expected -1 or "
+            f"more, and part_of at most {count - 1}"
         )
     parents = np.append(part_of, -1)  # row -1 is its own parent: none
     ancestor = np.arange(count)
@@ -172,7 +172,7 @@ def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> N
     for _ in range(count.bit_length()):
         ancestor, parents = parents[ancestor], parents[parents]
     if (ancestor >= 0).any():
-        raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is a part of itself, through part_of")
+        raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is part of itself, through part_of")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +194,12 @@ class Vocabulary:
         take_arrays(self, "vectors")
         if self.vectors.ndim != 2 or len(self.vectors) != len(self.names):
             raise OgPointcloudError(
-                f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; "
-                "expected one row a name"
+                f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; expected one row "
+                "per name"
             )
         object.__setattr__(self, "vectors", _as_stored(self.vectors, np.float32, "vocabulary vectors"))
         if not np.isfinite(self.vectors).all():
-            raise OgPointcloudError("vocabulary vectors hold NaN or infinity")
+            raise OgPointcloudError("vocabulary vectors contain NaN or infinity; expected finite numbers")
         if not all(isinstance(name, str) for name in self.names):
             raise OgPointcloudError(f"the words are {[*self.names]!r:.80}; expected strings")
 
@@ -293,7 +293,7 @@ class LabelledCloud:
         if self.xyz.shape != (n, 3) or self.origin.shape != (3,) or self.instance_ids.shape != (n,):
             raise OgPointcloudError(
                 f"xyz {self.xyz.shape}, origin {self.origin.shape} and instance ids {self.instance_ids.shape} do not "
-                "fit; expected (n, 3), (3,) and (n,)"
+                "fit together; expected (n, 3), (3,) and (n,)"
             )
         if self.xyz.dtype != np.float32:
             raise OgPointcloudError(
@@ -319,7 +319,7 @@ class LabelledCloud:
                     f"{name} is {value}; expected a positive length, {LENGTH_LIMITS[0]} to {LENGTH_LIMITS[1]}"
                 )
         if not (np.abs(self.origin) <= MAX_ORIGIN).all():
-            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {MAX_ORIGIN:g}")
+            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers up to {MAX_ORIGIN:g}")
         space = self.space  # raises if the name is no string
         if self.word_bank is not None:
             space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
@@ -368,8 +368,8 @@ def finite_rows(vectors: ArrayLike, what: str) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):
         rows = np.asarray(vectors).astype(np.float32)
     if rows.ndim != 2:
-        raise FeatureSpaceError(f"the {what} have shape {rows.shape}; expected (count, width)")
+        raise FeatureSpaceError(f"the {what} have shape {rows.shape}; expected (count, dimension)")
     if not np.isfinite(rows).all():
         row = int(np.argmin(np.isfinite(rows).all(axis=1)))
-        raise FeatureSpaceError(f"row {row} of the {what} holds NaN or infinity; expected numbers: encode it again")
+        raise FeatureSpaceError(f"row {row} of the {what} contains NaN or infinity; expected numbers: encode it again")
     return rows

@@ -19,19 +19,19 @@ class LeftOut(Enum):
     """What a fit can leave out: its key in provenance, then what it is and why, with placeholders for numbers."""
 
     # fmt: off
-    COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another lies, and get its label"
+    COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another does, and get its label"
     SHAPES = (
         "shapes of Gaussians", "scale, rotation and opacity of the Gaussians",
-        "views are asked along the ray of each one's center",
+        "visibility is tested along the ray through each center",
     )
     CHOICE_OF_SPLATS = "choice of splats", "choice of scale", "the file holds Gaussians"
     CHOICE_OF_SCALE = (
         "choice of scale", "choice of the points' size",
-        "too few views can judge others here: points are drawn {scale:g} spacings large",
+        "too few views can be compared here: points are drawn {scale:g} spacings large",
     )
     CHOICE_IN_PAPER_MODE = (
         "choice of splats, mode paper", "choice of scale",
-        "mode paper draws points as full as trained Gaussians are",
+        "mode paper draws points as large and opaque as trained Gaussians",
     )
     CHOICE_POINTS = (
         "points of the choice of splats", "{share:.0%} of the points in the choice of scale",
@@ -44,28 +44,28 @@ class LeftOut(Enum):
     RENDERING = "rendering", "rendering of {count} views", "an interrupted fit kept them in '{folder}'"
     VIEWS = (
         "views", "{count} of {total} views",
-        "nearly all that each of them and its masks show is shown by {enough} of the others",
+        "nearly everything that each of them and its masks show is shown by {enough} other views",
     )
     FINE_POINTS = (
         "points finer than pixels", "{share:.0%} of the points in the images",
-        "closer together than {finest_px:g} px, or more than {most:,} in one: larger ones stand in",
+        "closer together than {finest_px:g} px, or more than {most:,} in one image: larger points stand in",
     )
     SPANNING_MASKS = (
         "spanning masks", "{count} masks",
-        "each of them holds several things: they tell points only that they are of one of these",
+        "each covers several things: its points are only known to belong to one of these",
     )
     CONTRADICTED_GROUPS = (
         "contradicted groups", "{count} of {total} groups of masks",
-        "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
+        "views that see their points usually have no such mask, far more often than the proposer's misses explain",
     )
     SECOND_LEVEL = "second level", "the codebook's second level", "no view shows two masks in one coarse cluster"
     WHOLE_FIT = (
-        "whole fit", "a fit of all points at once", "{count:,} points take more memory than it has: fitted in tiles",
+        "whole fit", "a fit of all points at once", "{count:,} points need more memory than there is: fitted in tiles",
     )
     VOCABULARY = "vocabulary", "vocabulary", "{reason}"
     WORD_BANK = "word bank", "word bank", "{reason}"
-    EMPTY_LEAVES = "empty leaves", "{count} of {total} leaves", "no visible Gaussian is in them"
-    FAINT_GAUSSIANS = "faint gaussians", "{count} Gaussians", "less opaque than {opacity}: they cannot be seen"
+    EMPTY_LEAVES = "empty leaves", "{count} of {total} leaves", "they contain no visible Gaussian"
+    FAINT_GAUSSIANS = "faint gaussians", "{count} Gaussians", "opacity below {opacity}: they cannot be seen"
     # fmt: on
 
     def __init__(self, key: str, what: str, why: str) -> None:

@@ -166,7 +166,7 @@ class EncoderFormat:
                     return file.read(size)  # not the limit, which it would allocate
         except FileNotFoundError:
             raise OgPointcloudError(f"{path} is missing: {self.remake}") from None
-        raise OgPointcloudError(f"{path} has {size}, more than {most} bytes: {self.remake}")
+        raise OgPointcloudError(f"{path} has {size} bytes; expected at most {most}: {self.remake}")
 
     def checked(self, files: Mapping[str, bytes], where: str, take: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
         """The manifest, if all files are consistent. take: checks its other fields, and raises KeyError, TypeError or
@@ -183,13 +183,13 @@ class EncoderFormat:
             for name in sorted((needed | {*files, *manifest["files"]}) - {MANIFEST}):
                 # Not its sha256: eight times as slow, and whoever can change a file can change its manifest.
                 if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
-                    raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
+                    raise ValueError(f"{name} does not match the manifest's checksum: it is damaged or was changed")
             check_graph(files[self.graph], self.operators)
             take(manifest)
         except KeyError as error:
             raise OgPointcloudError(f"{where}: {error} is missing: {self.remake}") from None
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise OgPointcloudError(f"{where}: not an encoder that can be used ({error}): {self.remake}") from None
+            raise OgPointcloudError(f"{where}: not a usable encoder ({error}): {self.remake}") from None
         return manifest
 
     def feature_space(self, folder: Path) -> str | None:
@@ -226,7 +226,7 @@ class EncoderFormat:
             ) from None
         if vectors.dtype != np.float32 or vectors.shape != shape or not np.isfinite(vectors).all():
             raise OgPointcloudError(
-                f"{where}: {self.graph} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
+                f"{where}: {self.graph} returns {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
                 f"{shape}: {self.remake}"
             )
         return vectors
@@ -241,7 +241,7 @@ def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
         if number == 25:  # ModelProto.functions
             raise ValueError("it defines functions of its own")
         if number == 8 and (domain := text_of(value, 1)) not in STANDARD_DOMAINS:  # ModelProto.opset_import.domain
-            raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
+            raise ValueError(f"it uses operators of {domain!r:.40}, which are not standard")
         if number == 7:  # ModelProto.graph
             _check_parts(value, operators)
 
@@ -253,23 +253,23 @@ def _check_parts(graph: memoryview | int, operators: frozenset[str] | None) -> N
         elif number == 5:  # GraphProto.initializer
             constant_of(part)
         elif number == 15:  # GraphProto.sparse_initializer
-            raise ValueError("it holds sparse constants")
+            raise ValueError("it contains sparse constants")
 
 
 def _check_node(node: memoryview | int, operators: frozenset[str] | None) -> None:
     operator, domain = text_of(node, 4), text_of(node, 7)  # NodeProto.op_type and .domain
     if domain not in STANDARD_DOMAINS:
-        raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
+        raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, which is not standard")
     if operators is not None and operator not in operators:
-        raise ValueError(f"it uses the operator {operator!r:.40}, which it has no need of")
+        raise ValueError(f"it uses the operator {operator!r:.40}, which it does not need")
     for number, attribute in message_fields(node):
         if number != 5:  # NodeProto.attribute
             continue
         for kind, value in message_fields(attribute):
             if kind in (6, 11):  # AttributeProto.g, .graphs
-                raise ValueError(f"its node {operator!r:.40} holds a graph of its own")
+                raise ValueError(f"its node {operator!r:.40} contains a graph of its own")
             if kind in (10, 22, 23):  # AttributeProto.tensors, .sparse_tensor, .sparse_tensors
-                raise ValueError(f"its node {operator!r:.40} holds lists of constants")
+                raise ValueError(f"its node {operator!r:.40} contains lists of constants")
             if kind == 5:  # AttributeProto.t
                 constant_of(value)
 
@@ -288,7 +288,7 @@ def constant_of(tensor: memoryview | int) -> Constant:
     kind, data, typed = 0, memoryview(b""), False
     for number, value in message_fields(tensor):
         if number == 13 or (number == 14 and value):  # TensorProto.external_data; .data_location, 1 is EXTERNAL
-            raise ValueError("it asks for other files of this machine")
+            raise ValueError("it refers to other files on this machine")
         if number == 1:  # TensorProto.dims
             shape += integers_of(value)
         elif number == 2:  # TensorProto.data_type
@@ -298,7 +298,7 @@ def constant_of(tensor: memoryview | int) -> Constant:
         elif number in (4, 5, 6, 7, 10, 11):  # float_data, int32_data and so on: numbers one by one
             typed = True
     if typed or not isinstance(kind, int) or kind not in TYPE_BYTES:
-        raise ValueError(f"it holds a constant of type {kind} that is not stored as plain bytes")
+        raise ValueError(f"it contains a constant of type {kind} that is not stored as plain bytes")
     if any(length < 0 for length in shape) or math.prod(shape) * TYPE_BYTES[kind] != len(data):
         raise ValueError(f"a constant of shape {shape} and type {kind} has {len(data)} bytes")
     return Constant(kind, tuple(shape), data)
@@ -342,7 +342,7 @@ def _varint(data: memoryview, position: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value & (1 << 64) - 1, position
-    raise ValueError("it is damaged: a number does not end")
+    raise ValueError("it is damaged: a number never ends")
 
 
 def _message(value: memoryview | int) -> memoryview:

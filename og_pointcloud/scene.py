@@ -119,25 +119,25 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         numbers = (self.width, self.height, *self.intrinsics)
         if not all(isinstance(number, Real) for number in numbers):
-            raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers of pixels")
+            raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers, in pixels")
         error, determinant = rotation_error(pose[:3, :3])
         if not error <= ROTATION_TOLERANCE or determinant < 0:  # also where the error is NaN
             raise SceneError(
-                f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
-                "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
+                f"camera rotation differs from a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a "
+                "rigid right-handed pose: remove scale or mirroring from the pose file"
             )
         # Sizes are checked before focal lengths, which are compared with them.
         if not all(1 <= side <= MAX_SIDE_PX and side == int(side) for side in (self.width, self.height)):
             raise SceneError(
-                f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
-                f"most {MAX_SIDE_PX} a side, in whole numbers: check w and h of the pose file"
+                f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected whole numbers from 1 to "
+                f"{MAX_SIDE_PX}: check w and h in the pose file"
             )
         for name in ("width", "height"):
             object.__setattr__(self, name, int(getattr(self, name)))  # 64.0 cannot be a shape
         if not np.isfinite(self.intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < MIN_FOCAL_SHARE:
             raise SceneError(
-                f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, fx and fy > 0 "
-                f"by {MIN_FOCAL_SHARE:g} of the image's sides or more: check the camera model in the pose file"
+                f"camera intrinsics fx, fy, cx, cy are {self.intrinsics}; expected finite numbers, with fx and fy at "
+                f"least {MIN_FOCAL_SHARE:g} of the image's sides: check the camera model in the pose file"
             )
 
     def resized(self, width: int, height: int) -> Camera:
@@ -215,23 +215,23 @@ class View:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise SceneError(f"a view is called {self.name!r:.80}; expected text, as its image's file stem is")
+            raise SceneError(f"a view's name is {self.name!r:.80}; expected text, such as its image's file stem")
         take_arrays(self, "image", "mask_features", "mask_tracks")
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
-                f"view '{self.name}': mask features are {features.dtype} {features.shape}; "
-                "expected float32 (masks, width): pass features.astype(np.float32)"
+                f"view '{self.name}': mask features are {features.dtype} {features.shape}; expected float32 (masks, "
+                "dimension): pass features.astype(np.float32)"
             )
         if features.shape[1] == 0 and len(features):
             raise SceneError(
-                f"view '{self.name}': the features of its {len(features)} masks have width 0; expected 1 or more: "
+                f"view '{self.name}': the features of its {len(features)} masks have dimension 0; expected 1 or more: "
                 "encode the masks, or give zero rows for those without a feature"
             )
         finite = np.isfinite(features).all(axis=1)
         if not finite.all():
             raise SceneError(
-                f"view '{self.name}': the feature of mask {int(np.argmin(finite)) + 1} holds NaN or infinity; "
+                f"view '{self.name}': the feature of mask {int(np.argmin(finite)) + 1} contains NaN or infinity; "
                 "expected finite numbers: encode this mask again or remove it"
             )
         tracks = self.mask_tracks
@@ -258,11 +258,11 @@ class View:
         if ids.shape != expected:
             raise SceneError(
                 f"view '{self.name}': the mask image is {ids.shape[1]}x{ids.shape[0]} pixels, its camera "
-                f"{expected[1]}x{expected[0]}: make the masks at the image's size or fix w and h of the pose file"
+                f"{expected[1]}x{expected[0]}: make the masks at the image's size or fix w and h in the pose file"
             )
         if ids.size and int(ids.min()) < NOT_SEEN:
             raise SceneError(
-                f"view '{self.name}': the mask map holds {int(ids.min())}; expected rows of mask_features, -1 or "
+                f"view '{self.name}': the mask map contains {int(ids.min())}; expected rows of mask_features, -1 or "
                 f"{NOT_SEEN}: set pixels without a mask to -1"
             )
         if ids.size and int(ids.max()) >= self.mask_count:
@@ -278,8 +278,8 @@ class View:
         expected = (self.camera.height, self.camera.width, 3)
         if image is not None and (image.shape != expected or image.dtype != np.uint8):
             raise SceneError(
-                f"view '{self.name}': the image is {image.dtype} {image.shape}; expected uint8 {expected}, as its "
-                "camera: fix w and h of the pose file, or scale colors to 0..255"
+                f"view '{self.name}': the image is {image.dtype} {image.shape}; expected uint8 {expected}, the size of "
+                "its camera: fix w and h in the pose file, or scale colors to 0..255"
             )
         return image
 
@@ -316,7 +316,7 @@ class Points:
         copied."""
         world = np.asarray(xyz)
         if world.ndim != 2 or world.shape[1] != 3 or world.dtype.kind not in "fiu":
-            raise SceneError(f"points are an array of {world.dtype} {world.shape}; expected numbers (points, 3)")
+            raise SceneError(f"points are {world.dtype} {world.shape}; expected numbers of shape (points, 3)")
         world = world.astype(np.float64)
         if len(world) == 0:
             raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
@@ -337,7 +337,7 @@ class Points:
         if self.xyz.shape != (n, 3) or self.xyz.dtype != np.float32 or np.shape(self.origin) != (3,):
             raise SceneError(
                 f"xyz is {self.xyz.dtype} {self.xyz.shape}, origin of shape {np.shape(self.origin)}; expected float32 "
-                f"{(n, 3)} near zero and (3,): Points.from_world(xyz) makes them of world coordinates"
+                f"{(n, 3)} near zero and (3,): Points.from_world(xyz) makes them from world coordinates"
             )
         widths = {"rgb": 3, "scale": 3, "rotation": 4, "opacity": None}
         for name, width in widths.items():
@@ -374,7 +374,7 @@ class Points:
     def gaussians(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Scale, rotation and opacity of every point; SceneError for a plain cloud."""
         if self.scale is None or self.rotation is None or self.opacity is None:
-            raise SceneError("the points have no scale, rotation and opacity; expected Gaussians, as a 3DGS file has")
+            raise SceneError("the points have no scale, rotation and opacity; expected Gaussians, as in a 3DGS file")
         return self.scale, self.rotation, self.opacity
 
     @property
@@ -392,8 +392,8 @@ def pose_matrix(pose: ArrayLike, what: str = "pose", cure: str = ", cloud to wor
         raise SceneError(f"{what} is {seen}; expected a finite 4x4 matrix{cure}")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise SceneError(
-            f"the last row of {what} is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is "
-            "the translation (transposed, perhaps?)"
+            f"the last row of {what} is {matrix[3].tolist()}; expected 0 0 0 1: pass the matrix whose last column is "
+            "the translation (this one may be transposed)"
         )
     return matrix.astype(np.float64)
 
@@ -424,8 +424,8 @@ def rounded_pose(pose: ArrayLike, spacing: float) -> str:
     if step <= spacing:
         return ""
     return (
-        f"float32 rounded the pose to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give it as "
-        "float64, of numbers that never were float32"
+        f"float32 rounded the pose to steps of {step:.3g}, but the scene's points lie {spacing:.3g} apart: pass "
+        "float64 numbers that were never float32"
     )
 
 
@@ -434,7 +434,7 @@ def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the 
     finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
     if not finite.all():
         raise SceneError(
-            f"{int((~finite).sum())} of {len(finite)} points hold NaN or infinity (the first is row "
+            f"{int((~finite).sum())} of {len(finite)} points contain NaN or infinity (the first is row "
             f"{int(np.argmin(finite))}); expected finite coordinates: {cure}"
         )
 
@@ -442,7 +442,7 @@ def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the 
 def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
     """Check Gaussians made by callers; file readers already activate scales and opacities and normalize quaternions."""
     fits = np.logical_and.reduce((scale >= 0) & (scale < np.inf), axis=1)
-    _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
+    _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of log scales")
     fits = np.logical_and(opacity >= 0, opacity <= 1)
     _require(fits, opacity, "opacity", "0 to 1: activate a 3DGS file's logits, 1 / (1 + exp(-x))")
     length = np.linalg.norm(rotation.astype(np.float64), axis=1)
@@ -478,14 +478,14 @@ class Scene:
         if len(widths) > 1:
             odd = next(f"{name}: {width}" for width, name in widths.items() if width != self.feature_width)
             raise SceneError(
-                f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd}); expected one width: "
+                f"mask features have {len(widths)} dimensions {sorted(widths)} (e.g. {odd}); expected one dimension: "
                 "encode all masks with the same model"
             )
         # Views are identified by name wherever something about them is stored: work folders, tables, messages.
         names = [view.name for view in self.views]
         if len(set(names)) != len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise SceneError(f"two views are called '{twice}'; expected unique image names")
+            raise SceneError(f"two views are named '{twice}'; expected unique image names")
 
     @property
     def feature_width(self) -> int:

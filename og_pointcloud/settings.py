@@ -54,7 +54,7 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
         if 0 <= value <= largest and not (value == 0 and least):
             return ""
     kind = "a whole number" if whole else "a finite number"
-    return kind + (" above 0" if least else " from 0") + " to 1" * most + ", below 2^63" * whole
+    return kind + (" above 0" if least else " of at least 0") + " and at most 1" * most + " and below 2^63" * whole
 
 
 @dataclass(frozen=True)

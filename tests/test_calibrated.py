@@ -171,7 +171,7 @@ def test_vectors_of_any_length(scene, made, size):
 def test_vectors_that_cannot_be_judged(scene):
     with pytest.raises(FeatureSpaceError, match="the vector of 'a' is zero"):
         og.segment(scene, {"a": np.zeros(64)})
-    with pytest.raises(FeatureSpaceError, match=rf"label vectors are of .*\(width 3\).*'{SPACE}' \(width 64\)"):
+    with pytest.raises(FeatureSpaceError, match=rf"label vectors are in .*\(dimension 3\).*'{SPACE}' \(dimension 64\)"):
         og.segment(scene, {"a": np.ones(3)})
 
 

@@ -427,7 +427,7 @@ NO_GRAY = "; expected a gray PNG of 8 or 16 bit"
     ("change", "says"),
     [
         (without("transforms.json"), r"has no pose file; expected transforms.json .* sparse/0"),
-        (posed(lambda content: content["frames"].append(content["frames"][0])), "two views are called 'frame_00'"),
+        (posed(lambda content: content["frames"].append(content["frames"][0])), "two views are named 'frame_00'"),
         (no_images, r"image 'images/frame_00.png' is not found, and the pose file has no w and h"),
         (no_cloud, r"no geometry; expected points.ply .*points3D.*--gaussians"),
         (two_pcds, r"has 2 .pcd files \(a.pcd, b.pcd, ...\); expected one: name the one"),
@@ -444,7 +444,7 @@ NO_GRAY = "; expected a gray PNG of 8 or 16 bit"
             lambda folder, names: write_features(folder, {name: np.ones((2, 8)) for name in names[:2]}),
             r"lacks 1 of 3 arrays, 'frame_02' first \(it has frame_00, frame_01",
         ),
-        (last_features(np.ones((2, 9))), r"2 widths \[8, 9\] \(e.g. frame_02: 9\)"),
+        (last_features(np.ones((2, 9))), r"2 dimensions \[8, 9\] \(e.g. frame_02: 9\)"),
         (last_features(np.full((2, 8), np.nan)), "view 'frame_02': the feature of mask 1 holds NaN"),
         (last_features(np.ones(8)), NO_FLOATS),
         (last_features(np.ones((2, 2, 2))), NO_FLOATS),

@@ -226,19 +226,19 @@ def test_numbers_that_are_none_give_one_error(bad):
     made = Made()
     texts = made.texts[:3].copy()
     texts[1, 5] = bad
-    with pytest.raises(FeatureSpaceError, match=r"row 1 of the label vectors holds NaN or infinity"):
+    with pytest.raises(FeatureSpaceError, match=r"row 1 of the label vectors contains NaN or infinity"):
         made.chooser.choose(texts)
 
 
 def test_widths_must_agree():
     made = Made()
-    with pytest.raises(FeatureSpaceError, match=r"label vectors are of .*\(width 3\); expected .*\(width 64\)"):
+    with pytest.raises(FeatureSpaceError, match=r"label vectors are in .*\(dimension 3\); expected .*\(dimension 64\)"):
         made.chooser.choose(np.ones((2, 3)))
-    with pytest.raises(FeatureSpaceError, match=r"bank.s vectors are of .*\(width 16\)"):
+    with pytest.raises(FeatureSpaceError, match=r"bank.s vectors are in .*\(dimension 16\)"):
         Chooser(made.table, WordBank(unit_rows(60, 16)))
-    with pytest.raises(FeatureSpaceError, match=r"shape \(64,\); expected \(count, width\)"):
+    with pytest.raises(FeatureSpaceError, match=r"shape \(64,\); expected \(count, dimension\)"):
         made.chooser.choose(made.texts[0])
-    with pytest.raises(FeatureSpaceError, match=r"word bank of 49 words; expected at least 50"):
+    with pytest.raises(FeatureSpaceError, match=r"a word bank of 49 words; expected at least 50"):
         WordBank(unit_rows(49))
 
 

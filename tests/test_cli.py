@@ -397,7 +397,7 @@ def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     error = error_of(capsys, *arguments[:5], "another space", *arguments[6:])
     assert "encode them with that encoder" in error
     np.savez(words, names=np.array(["cup"]), vectors=np.ones((1, 3)))
-    assert "(width 3); expected feature space 'their space' (width 8)" in error_of(capsys, *arguments)
+    assert "(dimension 3); expected feature space 'their space' (dimension 8)" in error_of(capsys, *arguments)
 
 
 def test_import_leaves_nothing_of_a_damaged_result(tmp_path, capsys):

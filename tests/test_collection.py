@@ -171,7 +171,7 @@ def test_given_vectors_are_asked_whatever_words_they_go_by(folder):
         expected = collection.find("chair")[0]
         assert (best.scene, best.instance, best.word) == (expected.scene, expected.instance, name) == ("a", 1, name)
         assert best.score == pytest.approx(expected.score, abs=1e-6)
-    with pytest.raises(FeatureSpaceError, match=r"the label vectors are .*\(width 5\); expected .*\(width 32\)"):
+    with pytest.raises(FeatureSpaceError, match=r"label vectors are .*\(dimension 5\); expected .*\(dimension 32\)"):
         collection.find({"chair": np.ones(5)})
     with pytest.raises(FeatureSpaceError, match="the vector of 'chair' is zero"):
         collection.find({"chair": np.zeros(WIDTH)})

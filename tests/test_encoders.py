@@ -126,7 +126,7 @@ def test_an_exported_folder_is_checked_before_it_runs(tmp_path):
         with pytest.raises(OgPointcloudError, match=message):
             OnnxModel(exported(tmp_path / "e", **wrong))
     model = OnnxModel(exported(tmp_path / "e", width=65))
-    with pytest.raises(OgPointcloudError, match="gives float32"):
+    with pytest.raises(OgPointcloudError, match="returns float32"):
         model(np.zeros((1, 3, 48, 48), np.float32))
     with pytest.raises(OgPointcloudError, match="does not run"):
         OnnxModel(DEMO_FOLDER / "image")(np.zeros((1, 4, 48, 48), np.float32))

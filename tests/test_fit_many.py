@@ -263,7 +263,7 @@ def test_warnings_come_with_the_capture_they_are_of(captures, one_by_one, tmp_pa
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
     columns = "".join(f"property float {axis}\n" for axis in "xyz")
     geometry.write_bytes(f"{header}{columns}end_header\n".encode() + vertices.tobytes())
-    with pytest.warns(UserWarning, match=r"^odd: .*1 of 1577 points hold NaN or infinity") as told:
+    with pytest.warns(UserWarning, match=r"^odd: .*1 of 1577 points contain NaN or infinity") as told:
         (fit,) = og.fit_many(odd, tmp_path / "out", Inline(), progress=False)
     assert [f"odd: {text}" for text in fit.warnings] == [str(warning.message) for warning in told]
 

@@ -145,7 +145,7 @@ def test_invalid_points_of_an_organized_cloud_are_left_out_of_fits_and_answered_
     np.testing.assert_array_equal(read_points(path).xyz_world, xyz)
     xyz[[2, 4]] = np.nan
     path.write_bytes(header.encode() + xyz.tobytes())
-    says = r"a\.pcd: 2 of 6 points hold NaN or infinity \(the first is row 2\): "
+    says = r"a\.pcd: 2 of 6 points contain NaN or infinity \(the first is row 2\): "
     with pytest.warns(UserWarning, match=f"{says}left out"):
         np.testing.assert_array_equal(read_points(path).xyz_world, xyz[[0, 1, 3, 5]])
     scene = make_cloud(xyz[[0, 1, 3, 5]], [0, 0, 1, 1])
@@ -154,7 +154,7 @@ def test_invalid_points_of_an_organized_cloud_are_left_out_of_fits_and_answered_
     np.testing.assert_array_equal(answer.instances, og.segment(xyz, ["apple"], scene).instances)
     assert answer.instances.tolist() == [0, 0, -3, 1, -3, 1]
     path.write_bytes(header.encode() + np.full_like(xyz, np.nan).tobytes())
-    with pytest.raises(SceneError, match="0 points, and 6 that hold NaN or infinity; expected at least one"):
+    with pytest.raises(SceneError, match="0 points, and 6 that contain NaN or infinity; expected at least one"):
         read_points(path)
 
 

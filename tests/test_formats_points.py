@@ -120,7 +120,7 @@ def test_points_with_nan_are_left_out_with_their_colors_and_one_warning(tmp_path
     path = tmp_path / "a.ply"
     columns = dict(zip(("x", "y", "z", "red", "green", "blue"), (*xyz.T, *rgb.T), strict=True))
     write_ply(path, {"vertex": join_columns(columns)})
-    says = r"2 of 30 points hold NaN or infinity \(the first is row 5\): left out"
+    says = r"2 of 30 points contain NaN or infinity \(the first is row 5\): left out"
     with pytest.warns(UserWarning, match=says) as caught:
         points = read_points(path)
     assert len(caught) == 1  # a signalling NaN is no other one

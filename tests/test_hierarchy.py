@@ -192,9 +192,9 @@ def test_a_table_keeps_its_hierarchy() -> None:
 @pytest.mark.parametrize(
     ("coarse", "whole", "message"),
     [
-        (None, [0, -1, -1], "a part of itself"),
-        (None, [1, 2, 0], "a part of itself"),
-        (None, [-1, 2, 1], "instance 1 is a part of itself"),
+        (None, [0, -1, -1], "is part of itself"),
+        (None, [1, 2, 0], "is part of itself"),
+        (None, [-1, 2, 1], "instance 1 is part of itself"),
         (None, [3, -1, -1], "part_of spans"),
         (None, [-2, -1, -1], "part_of spans"),
         ([-2, 0, 0], None, "coarse"),
@@ -219,6 +219,6 @@ def test_the_hierarchy_comes_back_from_its_file(tmp_path: Path) -> None:
 
 def test_files_with_a_damaged_hierarchy_are_refused(tmp_path: Path) -> None:
     file = write_bundle(room(200), tmp_path / "room.ogpc")
-    for bad, says in ((np.arange(9, dtype=np.int32), "a part of itself"), (np.zeros(8, np.int32), "whole.npy")):
+    for bad, says in ((np.arange(9, dtype=np.int32), "is part of itself"), (np.zeros(8, np.int32), "whole.npy")):
         with pytest.raises(BundleError, match=says):
             read_bundle(forged(file, tmp_path / "bad.ogpc", {WHOLE: npy_bytes(bad)}))

@@ -241,5 +241,5 @@ def test_words_are_ranked_as_segment_scores_them():
         assert [score for _, score in words] == sorted((score for _, score in words), reverse=True)
     hit = pick(scene, scene.xyz[np.argmax(scene.instance_ids == 1)])
     assert hit.words({"it": 3 * unit_rows(9)[2]})[0][0] == "it"
-    with pytest.raises(FeatureSpaceError, match=r"width 3"):
+    with pytest.raises(FeatureSpaceError, match=r"dimension 3"):
         hit.words({"narrow": np.ones(3)})

@@ -182,7 +182,7 @@ def test_a_capture_that_cannot_be_judged_is_refused_at_once(folder, tmp_path):
     shutil.copy(folder / "gt.npz", other / "gt.npz")
     words = dict(np.load(other / "text_features.npz"))
     np.savez(other / "text_features.npz", **(words | {"feature_space": np.array("another/model")}))
-    with pytest.raises(FeatureSpaceError, match="are of feature space 'another/model'"):
+    with pytest.raises(FeatureSpaceError, match="are in feature space 'another/model'"):
         read_subject(other)
 
 

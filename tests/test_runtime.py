@@ -400,7 +400,7 @@ def test_a_files_words_come_before_the_scenes(scene):
         ([1], OgPointcloudError, "label 1 is a int"),
         (5, OgPointcloudError, "label 5 is a int"),
         (b"apple", OgPointcloudError, "label b'apple' is a bytes"),
-        ({"a": np.ones(WIDTH - 1)}, FeatureSpaceError, rf"\(width {WIDTH - 1}\); expected .*\(width {WIDTH}\)"),
+        ({"a": np.ones(WIDTH - 1)}, FeatureSpaceError, rf"\(dimension {WIDTH - 1}\); expected .*\(dimension {WIDTH}\)"),
         ({"a": np.ones(WIDTH), "b": np.ones(3)}, FeatureSpaceError, r"'b' is float64 \(3,\)"),
         ({"a": np.ones((1, WIDTH))}, FeatureSpaceError, r"'a' is float64 \(1, 16\)"),
         ({"a": [[1, 2], [3]]}, FeatureSpaceError, "the vector of 'a' is object"),
@@ -424,7 +424,7 @@ def test_words_without_any_vocabulary():
 
 def test_text_features_of_another_space_are_refused(scene, tmp_path):
     np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)), feature_space=np.array("other"))
-    with pytest.raises(FeatureSpaceError, match=r"t.npz are of feature space 'other' .*expected .*'tiny-test-space':"):
+    with pytest.raises(FeatureSpaceError, match=r"t.npz are in feature space 'other' .*expected .*'tiny-test-space':"):
         og.segment(scene, ["a"], text_features=tmp_path / "t.npz")
     np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)))
     assert len(og.segment(scene, ["a"], text_features=tmp_path / "t.npz"))
@@ -578,7 +578,7 @@ def test_a_pose_that_float32_rounded_is_told_where_it_matters(scene, as_given):
         og.segment(sensor, WORDS, scene, pose=as_given(turn.astype(np.float32)))
         og.segment(mapped.xyz - shift[:3, 3], WORDS, mapped, pose=as_given(shift.astype(np.float32)))  # which is exact
     with pytest.warns(
-        UserWarning, match=r"float32 rounded the pose to steps of 0.5, the scene's points lie 0.05 apart"
+        UserWarning, match=r"float32 rounded the pose to steps of 0.5, but the scene's points lie 0.05 apart"
     ):
         og.segment(sensor, WORDS, mapped, pose=as_given(pose.astype(np.float32)))
 

@@ -72,7 +72,7 @@ def test_an_images_sides_are_whole_numbers():
     camera = Camera(64.0, np.float32(48), 50.0, 60.0, 30.0, 25.0, np.eye(4))
     assert (type(camera.width), type(camera.height), camera.width, camera.height) == (int, int, 64, 48)
     for side in (48.5, np.nan, np.inf):
-        with pytest.raises(SceneError, match=f"camera image is 64x{side}; expected at least 1x1 .* in whole numbers"):
+        with pytest.raises(SceneError, match=f"camera image is 64x{side}; expected whole numbers from 1 to"):
             Camera(64, side, 50.0, 60.0, 30.0, 25.0, np.eye(4))
 
 
@@ -132,13 +132,13 @@ def test_masks_that_are_no_map_of_whole_numbers_are_refused(masks: Any):
 @pytest.mark.parametrize("image", [np.zeros((3, 4, 3)), np.zeros((3, 4), np.uint8), np.zeros((4, 3, 3), np.uint8)])
 def test_photographs_that_are_no_bytes_of_the_cameras_size_are_refused(image: np.ndarray):
     with pytest.raises(
-        SceneError, match=r"view 'a': the image is .*; expected uint8 \(3, 4, 3\), as its camera: fix w"
+        SceneError, match=r"view 'a': the image is .*; expected uint8 \(3, 4, 3\), the size of its camera: fix w"
     ):
         _view(image=image).image_rgb()
 
 
 def test_views_without_a_name_and_scenes_without_a_point_are_refused():
-    with pytest.raises(SceneError, match="a view is called 3; expected text"):
+    with pytest.raises(SceneError, match="a view's name is 3; expected text"):
         _view(name=3)
     with pytest.raises(SceneError, match="the scene has 0 points; expected at least one"):
         Scene(Points(np.zeros((0, 3), np.float32), np.zeros(3)), (_view(),), "letters")

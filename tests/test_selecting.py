@@ -109,7 +109,7 @@ def test_more_or_less_than_one_text_is_refused(text):
 def test_wrong_words_are_refused(scene):
     with pytest.raises(OgPointcloudError, match="not among the"):
         og.select(scene, "zebra")
-    with pytest.raises(FeatureSpaceError, match="width 4"):
+    with pytest.raises(FeatureSpaceError, match="dimension 4"):
         og.select(scene, {"mug": np.ones(4)})
 
 

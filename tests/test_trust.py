@@ -149,7 +149,7 @@ def test_a_manifest_is_bounded_before_it_is_read(bundle, tmp_path):
     "frame", [{"spacing": 5e-324}, {"reach": 1e300}, {"origin": [1e30, 0, 0]}], ids=lambda frame: next(iter(frame))
 )
 def test_lengths_whose_squares_are_no_numbers(bundle, tmp_path, frame):
-    with pytest.raises(BundleError, match=r"expected (a positive length, 1e-30 to|finite numbers of up to 1e\+15)"):
+    with pytest.raises(BundleError, match=r"expected (a positive length, 1e-30 to|finite numbers up to 1e\+15)"):
         og.load(forged(bundle, tmp_path / "s.ogpc", {}, lambda manifest: manifest["frame"].update(frame)))
 
 

@@ -92,9 +92,9 @@ def test_a_file_without_words_gets_some(without_words, tmp_path):
 
 
 def test_words_of_another_space_or_width_change_nothing(path, bundle_file):
-    with pytest.raises(FeatureSpaceError, match="words are of feature space 'other' \\(width 16\\)"):
+    with pytest.raises(FeatureSpaceError, match="words are in feature space 'other' \\(dimension 16\\)"):
         add_words(path, NEW, "other")
-    with pytest.raises(FeatureSpaceError, match="width 8"):
+    with pytest.raises(FeatureSpaceError, match="dimension 8"):
         add_words(path, Vocabulary(("a",), unit_rows(1, 8)), SPACE)
     assert path.read_bytes() == bundle_file.read_bytes()
     assert add_words(path, NEW, "unknown").names[-2:] == NEW.names
@@ -104,7 +104,7 @@ def test_words_of_another_width_change_nothing_where_no_instance_is_described(tm
     described = instance_table(1)
     bare = replace(described, descriptors=np.zeros((0, 0), np.float32), descriptor_instance=np.zeros(0, np.int32))
     path = write_bundle(make_cloud(np.zeros((1, 3)), [0], instances=bare), tmp_path / "bare.ogpc")
-    with pytest.raises(FeatureSpaceError, match=r"the words are of .*\(width 8\); expected .*\(width"):
+    with pytest.raises(FeatureSpaceError, match=r"the words are in .*\(dimension 8\); expected .*\(dimension"):
         add_words(path, Vocabulary(("a",), unit_rows(1, 8)), SPACE)
     assert og.load(path).vocabulary.names == tuple(WORDS)
 
@@ -196,7 +196,7 @@ def test_the_writer_stores_a_clouds_bank(tmp_path):
     path = write_bundle(replace(room(100), word_bank=bank), tmp_path / "s.ogpc")
     assert np.abs(read_bundle(path).cloud.word_bank.vectors - bank.vectors).max() < 1e-3
     with pytest.raises(
-        FeatureSpaceError, match=rf"bank's vectors .*\(width 8\); expected .*{SPACE}' \(width {WIDTH}\)"
+        FeatureSpaceError, match=rf"bank's vectors .*\(dimension 8\); expected .*{SPACE}' \(dimension {WIDTH}\)"
     ):
         replace(room(100), word_bank=WordBank(unit_rows(80, 8)))
 
@@ -212,7 +212,7 @@ def test_the_command_stores_a_bank_of_text_features(path, tmp_path, capsys):
     np.savez(tmp_path / "other.npz", names=names, vectors=unit_rows(60), feature_space="other")
     for arguments, says in (
         ((tmp_path / "few.npz",), "few.npz: a word bank of 49 words; expected at least 50"),
-        ((tmp_path / "other.npz",), "words of the bank are of feature space 'other'"),
+        ((tmp_path / "other.npz",), "words of the bank are in feature space 'other'"),
         ((), f"export text MODEL_FOLDER --feature-space {SPACE}"),
     ):
         assert says in error_of(capsys, "vocabulary", "bank", path, *arguments)
@@ -269,7 +269,7 @@ def test_fit_stores_the_bank_asked_for_else_its_own_else_the_encoders(encoder_fo
     def fit(*arguments):
         return main(["fit", str(folder), "-o", str(path), *map(str, arguments)])
 
-    for bank, says in (("few", "a word bank of 49"), ("wide", "(width 20); expected"), ("other", "space 'other'")):
+    for bank, says in (("few", "a word bank of 49"), ("wide", "(dimension 20);"), ("other", "space 'other'")):
         assert fit("--word-bank", tmp_path / f"{bank}.npz") == 2
         assert says in capsys.readouterr().err
         assert not path.exists()
@@ -294,7 +294,7 @@ def test_fit_stores_the_bank_asked_for_else_its_own_else_the_encoders(encoder_fo
     monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(torn))
     before = path.read_bytes()
     assert fit() == 2
-    assert "tokenizer.json has not the manifest's checksum" in capsys.readouterr().err
+    assert "tokenizer.json does not match the manifest's checksum" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 
@@ -322,7 +322,7 @@ def test_banks_of_encoders_are_checked(encoder_folder, tmp_path, bank):
     manifest["files"]["word_bank.npy"] = {"crc32": zlib.crc32(data)}
     folder = copytree(encoder_folder, tmp_path / "other")
     (folder / "word_bank.npy").write_bytes(data)
-    with pytest.raises(OgPointcloudError, match=r"word_bank\.npy has not the manifest's checksum"):
+    with pytest.raises(OgPointcloudError, match=r"word_bank\.npy does not match the manifest's checksum"):
         read_text_encoder(folder)
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(OgPointcloudError, match=r"word_bank\.npy cannot be used"):
@@ -388,7 +388,7 @@ def test_the_writer_carries_an_encoder_too(encoder_folder, tmp_path, capsys):
     assert run("carry", path, encoder_folder, "-o", tmp_path / "t.ogpc") == 0
     assert "carries its text encoder (fp32" in capsys.readouterr().out
     assert (tmp_path / "t.ogpc").read_bytes() == path.read_bytes()
-    with pytest.raises(FeatureSpaceError, match=r"of feature space .*expected feature space 'other'"):
+    with pytest.raises(FeatureSpaceError, match=r"in feature space .*expected feature space 'other'"):
         write_bundle(replace(room(100), feature_space="other"), tmp_path / "o.ogpc", text_encoder=encoder_folder)
     assert not (tmp_path / "o.ogpc").exists()
 

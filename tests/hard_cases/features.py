@@ -105,7 +105,7 @@ def width(columns: float) -> Answer:
     return Answer(ours, _cosines(descriptors, text), lambda: naive.cosines(descriptors, text, np.float16))
 
 
-@refuses(SceneError, "the feature of mask 2 holds NaN", "expected finite", "encode this mask again or remove it")
+@refuses(SceneError, "the feature of mask 2 contains NaN", "expected finite", "encode this mask again or remove it")
 def feature_not_a_number() -> object:
     """A feature with NaN in it."""
     rows = unit_rows(3, 8)
@@ -113,7 +113,7 @@ def feature_not_a_number() -> object:
     return _one_view(rows)
 
 
-@refuses(SceneError, "of mask 1 holds NaN or infinity", "expected finite", "encode this mask again or remove it")
+@refuses(SceneError, "of mask 1 contains NaN or infinity", "expected finite", "encode this mask again or remove it")
 def feature_beyond_float32() -> object:
     """A feature of 1e40, as float64 files may hold it."""
     from og_pointcloud.formats.mask_files import as_features
@@ -121,22 +121,20 @@ def feature_beyond_float32() -> object:
     return _one_view(as_features(np.full((1, 8), 1e40), "1e40:"))
 
 
-@refuses(SceneError, "features of its 2 masks have width 0", "expected 1 or more", "encode the masks")
+@refuses(SceneError, "features of its 2 masks have dimension 0", "expected 1 or more", "encode the masks")
 def features_of_width_0() -> object:
     """Features without a column."""
     return _one_view(np.zeros((2, 0), np.float32))
 
 
-@refuses(
-    SceneError, "mask features have 2 widths [8, 16]", "expected one width", "encode all masks with the same model"
-)
+@refuses(SceneError, "have 2 dimensions [8, 16]", "expected one dimension", "encode all masks with the same model")
 def features_of_two_widths() -> object:
     """Views whose features were made by different encoders."""
     scene, _ = two_balls()
     return Scene(scene.points, (*scene.views, replace(_one_view(unit_rows(2, 16)), name="other")), SPACE)
 
 
-@refuses(FeatureSpaceError, "(width 8); expected", "(width 16)", "encode them with")
+@refuses(FeatureSpaceError, "(dimension 8); expected", "(dimension 16)", "encode them with")
 def text_of_another_width() -> object:
     """Words of another encoder than the scene's."""
     return segment(labelled_cloud(), {"chair": unit_rows(1, 8)[0]})

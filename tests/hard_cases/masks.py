@@ -68,7 +68,7 @@ def mask_without_a_row() -> object:
     return fit(_with_masks(lambda _, ids: ids, unit_rows(1, 8)), progress=False)
 
 
-@refuses(SceneError, "the mask map holds -3", "expected rows of mask_features, -1 or -2", "set pixels")
+@refuses(SceneError, "the mask map contains -3", "expected rows of mask_features, -1 or -2", "set pixels")
 def mask_id_below_none() -> object:
     """A mask id of -3, below those for "no mask" and "not seen"."""
     return fit(_with_masks(lambda _, ids: ids - 2), progress=False)

@@ -130,7 +130,7 @@ def vector_not_a_number() -> object:
     return segment(labelled_cloud(), {"chair": np.ones(16), "desk": np.full(16, np.nan)})
 
 
-@refuses(FeatureSpaceError, "of feature space 'another'", "expected feature space 'catalogue'", "encode them with")
+@refuses(FeatureSpaceError, "in feature space 'another'", "expected feature space 'catalogue'", "encode them with")
 def words_of_another_space() -> object:
     """Words of another encoder, of the same width."""
     words = Vocabulary(("chair",), unit_rows(1, 16))
