@@ -181,7 +181,7 @@ def test_language_features_are_found(capture):
 
 
 def test_a_mask_level_of_masks_without_levels_is_refused(capture):
-    with pytest.raises(SceneError, match=r"mask level is 'small', but the masks of .* have no levels; expected none"):
+    with pytest.raises(SceneError, match=r"mask level is 'small', but the masks of .* have no levels; expected no level"):
         read_capture(capture[0], mask_level="small")
 
 
@@ -349,7 +349,7 @@ def test_points_of_colmap_go_with_its_own_poses_alone(tmp_path):
     (tmp_path / "points.ply").unlink()
     write_colmap_binary(tmp_path / "sparse/0", world)
     write_transforms(tmp_path, world)
-    refused(tmp_path, r"points3D may be another .* remove transforms.json, so that COLMAP's poses")
+    refused(tmp_path, r"points3D may differ .* remove transforms.json, so that COLMAP's poses")
     (tmp_path / "transforms.json").unlink()
     np.testing.assert_allclose(read_capture(tmp_path).points.xyz_world, world.xyz, atol=1e-5)
 
@@ -359,7 +359,7 @@ def test_ply_file_path_stays_inside(capture, path):
     folder, _ = capture
     shutil.copy(folder / "points.ply", folder.parent / "points.ply")
     edit_poses(folder, lambda content: content.update(ply_file_path=path))
-    refused(folder, r"ply_file_path is '.*', which is no file inside the capture folder; .*--gaussians")
+    refused(folder, r"ply_file_path is '.*', which is not a file inside the capture folder; .*--gaussians")
 
 
 # Errors at the door.
@@ -419,8 +419,8 @@ def no_images(folder, names):
     edit_poses(folder, lambda content: [content.pop(key) for key in ("w", "h")])
 
 
-NO_FLOATS = r"'frame_02': features are .*; expected floats of shape \(masks, width\)"
-NO_GRAY = "; expected a gray PNG of 8 or 16 bit"
+NO_FLOATS = r"'frame_02': features are .*; expected floats of shape \(masks, dimension\)"
+NO_GRAY = "; expected an 8-bit or 16-bit gray PNG"
 
 
 @pytest.mark.parametrize(
@@ -442,10 +442,10 @@ NO_GRAY = "; expected a gray PNG of 8 or 16 bit"
         ),
         (
             lambda folder, names: write_features(folder, {name: np.ones((2, 8)) for name in names[:2]}),
-            r"lacks 1 of 3 arrays, 'frame_02' first \(it has frame_00, frame_01",
+            r"lacks 1 of 3 arrays, e.g. 'frame_02' \(it has frame_00, frame_01",
         ),
         (last_features(np.ones((2, 9))), r"2 dimensions \[8, 9\] \(e.g. frame_02: 9\)"),
-        (last_features(np.full((2, 8), np.nan)), "view 'frame_02': the feature of mask 1 holds NaN"),
+        (last_features(np.full((2, 8), np.nan)), "view 'frame_02': the feature of mask 1 contains NaN"),
         (last_features(np.ones(8)), NO_FLOATS),
         (last_features(np.ones((2, 2, 2))), NO_FLOATS),
         (last_features(np.ones((2, 8), int)), NO_FLOATS),
@@ -453,9 +453,9 @@ NO_GRAY = "; expected a gray PNG of 8 or 16 bit"
             lambda folder, names: write_masks(folder, names, size=(HEIGHT, WIDTH)),
             r"view 'frame_00': the masks are 48x64 pixels, its camera 64x48; expected",
         ),
-        (a_mask_of(np.zeros((HEIGHT, WIDTH, 3), np.uint8)), r"RGB \(3 channels\) PNG of 8 bit" + NO_GRAY),
-        (a_mask_of(np.zeros((HEIGHT, WIDTH, 4), np.uint16)), r"RGBA \(4 channels\) PNG of 16 bit" + NO_GRAY),
-        (mask_bytes(png_with_header(WIDTH, HEIGHT, 4, 0)), r"frame_01.png is a gray PNG of 4 bit"),
+        (a_mask_of(np.zeros((HEIGHT, WIDTH, 3), np.uint8)), r"a PNG, 8-bit RGB \(3 channels\)" + NO_GRAY),
+        (a_mask_of(np.zeros((HEIGHT, WIDTH, 4), np.uint16)), r"a PNG, 16-bit RGBA \(4 channels\)" + NO_GRAY),
+        (mask_bytes(png_with_header(WIDTH, HEIGHT, 4, 0)), r"frame_01.png is a PNG, 4-bit gray"),
         (mask_bytes(png_with_header(2**31 - 1, 2**31 - 1, 8, 0)), "frame_01.png .*at most 134217728 pixels"),
         (mask_bytes(b"\xff\xd8\xff\xe0JFIF" * 10), "frame_01.png is not a PNG"),
         (mask_bytes(b""), "frame_01.png is not a PNG"),

@@ -197,7 +197,7 @@ def test_las_with_more_labels_than_classes(tmp_path):
     las = laspy.read(segmentation([0, 191, 192, 199, -1], names).save(tmp_path / "many.las"))
     assert las.classification.tolist() == [64, 255, 1, 1, 1]
     assert las.og_label.tolist() == [0, 191, 192, 199, -1]
-    with pytest.raises(SceneError, match=r"5000 names take \d+ bytes; LAS holds 65535"):
+    with pytest.raises(SceneError, match=r"5000 names take \d+ bytes; LAS stores 65535"):
         segmentation([0], names * 25).save(tmp_path / "more.las")
 
 

@@ -454,7 +454,7 @@ def test_nothing_is_warned_of_a_right_room():
     ],
 )  # fmt: skip
 def test_what_is_no_repair_is_refused_with_the_names_of_those_that_are(text):
-    with pytest.raises(SceneError, match="is no repair; expected name=value with a name of aligned, axes"):
+    with pytest.raises(SceneError, match="is not a repair; expected name=value, name one of aligned, axes"):
         Repair.parse(text)
 
 

@@ -227,7 +227,7 @@ def test_poses_in_millimeters_with_depth_in_meters_are_doubted(tmp_path):
         for row in frame["transform_matrix"][:3]:
             row[3] *= 1000
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match="if all depths are taken times 1000: give the depth unit"):
+    with pytest.warns(UserWarning, match="if all depths are multiplied by 1000: state the depth unit"):
         fuse_capture(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

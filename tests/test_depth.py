@@ -92,7 +92,7 @@ def test_damaged_files_name_the_cure(tmp_path, name, content, said):
 
 def test_pictures_of_depth_and_objects_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "grey.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(SceneError, match="gray of 16 bit"):
+    with pytest.raises(SceneError, match="16-bit gray"):
         read(tmp_path / "grey.png")
     np.save(tmp_path / "o.npy", np.array([{"a": 1}], object), allow_pickle=True)
     with pytest.raises(SceneError, match="cannot be read"):
@@ -100,7 +100,7 @@ def test_pictures_of_depth_and_objects_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(5, np.float32))
     with pytest.raises(SceneError, match=r"float32 \(5,\)"):
         read(tmp_path / "flat.npy")
-    with pytest.raises(SceneError, match="is no file"):
+    with pytest.raises(SceneError, match="is not a file"):
         read(tmp_path / "gone.png")
 
 
@@ -308,7 +308,7 @@ def test_a_wrong_unit_is_named(tmp_path):
         for frame in write_frames(tmp_path)
     ]
     said = doubtful_depth(frames)
-    assert "times 0.001" in said
+    assert "multiplied by 0.001" in said
 
 
 def test_survey_of_exact_depth_knows_the_pixel(tmp_path):

@@ -163,7 +163,7 @@ def test_a_file_without_usable_images_leaves_nothing_behind(tmp_path):
     write_e57(tmp_path / "a.e57")
     assert main(["import", str(tmp_path / "a.e57"), "-o", str(tmp_path / "capture")]) != 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.e57"]
-    with pytest.raises(SceneError, match="no image of it can be used"):
+    with pytest.raises(SceneError, match="none of its images can be used"):
         unpack_e57(tmp_path / "a.e57", tmp_path / "capture")
 
 
@@ -199,7 +199,7 @@ def test_a_sphere_of_another_size_is_not_unpacked(tmp_path, monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", None)
     count, unused = unpack_e57(tmp_path / "a.e57", tmp_path / "made")
     assert count == 1
-    assert "of another size" in unused[0]
+    assert "its size is not the one" in unused[0]
 
 
 def test_nothing_is_unpacked_through_a_link(tmp_path):

@@ -183,7 +183,7 @@ SMALL = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nP
         ("FIELDS x y z", "VALUES x y z", "not a PCD file"),
         ("DATA binary\n", "", "no line 'DATA'"),
         ("DATA binary", "DATA packed", "expected one of ascii, binary, binary_compressed"),
-        ("FIELDS x y z", "FIELDS x y x", "each once"),
+        ("FIELDS x y z", "FIELDS x y x", "none twice"),
         ("SIZE 4 4 4", "SIZE 4 4", "PCD SIZE is '4 4'; expected 3 whole numbers"),
         ("SIZE 4 4 4", "SIZE 4 4 3", "field 'z' has TYPE F SIZE 3 COUNT 1"),
         ("TYPE F F F", "TYPE F F", "PCD TYPE has 2 entries"),

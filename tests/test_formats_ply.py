@@ -188,10 +188,10 @@ def test_damaged_headers(tmp_path, header, message):
         (ASCII + VERTEX, b"1\n2\n", "expected 3 rows, the file has 2: it is truncated"),
         (ASCII + VERTEX, b" \n", "expected 3 rows, the file has 0"),
         (ASCII + VERTEX, b"1\nabc\n3\n", "'abc'"),
-        (ASCII + VERTEX, b"1\n2 2\n3\n", "expected 1 values a row"),
+        (ASCII + VERTEX, b"1\n2 2\n3\n", "expected 1 values per row"),
         (ASCII + VERTEX, b"1 2\n2 3\n3 4\n", "expected 1 values"),
         (ASCII + "element vertex 1\nproperty float x\nproperty uchar red\n", b"1 300\n",
-         r"'300' to uint8|no whole number of the type"),
+         r"'300' to uint8|not a whole number of the type"),
     ],
 )  # fmt: skip
 def test_rows_that_do_not_fit_the_header_are_refused_before_memory_is_taken(tmp_path, header, body, message):
@@ -202,7 +202,7 @@ def test_rows_that_do_not_fit_the_header_are_refused_before_memory_is_taken(tmp_
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_vertices_behind_lists_are_refused(tmp_path, encoding):
     header = f"ply\nformat {encoding} 1.0\n{FACES}{VERTEX}"
-    with pytest.raises(SceneError, match=r"no element 'vertex' before the first with lists .faces.*vertices first"):
+    with pytest.raises(SceneError, match=r"no element 'vertex' before the first one with lists .faces.*vertices first"):
         read_points(write(tmp_path / "a.ply", header, face_bytes(encoding)))
 
 

@@ -484,7 +484,7 @@ def test_text_of_characters_that_there_are_not():
     data = npy_bytes(np.array(["chair"]))
     assert array_from_npy(data[:-4] + b"\xff\xff\x10\0")[0] == "chai\U0010ffff"
     for last in (b"\0\0\x11\0", b"\xff\xff\xff\xff"):
-        with pytest.raises(ValueError, match="characters that there are not"):
+        with pytest.raises(ValueError, match="characters that do not exist"):
             array_from_npy(data[:-4] + last)
 
 
@@ -522,7 +522,7 @@ def test_long_names_do_not_make_long_messages(folder, tmp_path):
 @pytest.mark.parametrize(
     ("place", "number", "says"),
     [
-        (10, struct.pack("<H", 14), "packed by method 14"),
+        (10, struct.pack("<H", 14), "compressed by method 14"),
         (20, struct.pack("<I", 2**30 - 999), "claims 1073740825 bytes"),
     ],
 )

@@ -193,7 +193,7 @@ def test_a_long_lens_is_one_view_to_its_rim(cx):
 
 
 def test_a_lens_that_looks_elsewhere_is_refused():
-    with pytest.raises(SceneError, match="sees nothing before the camera"):
+    with pytest.raises(SceneError, match="sees nothing in front of it"):
         faces(Camera(64, 48, 60.0, 60.0, 4000.0, 24.0, np.eye(4)), lens("barrel"))
 
 

@@ -464,10 +464,10 @@ def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path
     limits, points, xyz = resource.getrlimit(resource.RLIMIT_FSIZE), mapper.points, mapper._map.points.xyz.copy()
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "frames.log").stat().st_size + 1000, limits[1]))
-        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the room there"):
+        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the free space"):
             mapper.integrate(second)
         resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "frames.log").stat().st_size + 10, limits[1]))
-        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the room there"):
+        with pytest.raises(OgPointcloudError, match="check the path, its permissions, and the free space"):
             mapper.correct(turned)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

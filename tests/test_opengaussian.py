@@ -152,7 +152,7 @@ def with_value(values, at, value):
         (changed("occu_count", lambda v: v - 5), "occu_count row 0 holds -3"),
         (changed("occu_count", lambda v: v * 1e30), "occu_count row 0 holds 2e"),
         (changed("occu_count", lambda v: v.astype(object)), "Python objects"),
-        ({"leaf_feat": np.ones((2, 2))}, "lacks 3 of 4 arrays, 'leaf_score' first"),
+        ({"leaf_feat": np.ones((2, 2))}, "lacks 3 of 4 arrays, e.g. 'leaf_score'"),
     ],
 )
 def test_bad_arrays_are_named(tmp_path, arrays, text):

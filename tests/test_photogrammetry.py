@@ -147,7 +147,7 @@ def test_chunks_of_one_world_are_read_together_and_others_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("<f>72</f>", "<f>wide</f>"), r"camera 'frame_00': <f> holds 'wide'; expected 1 numbers"),
+        (("<f>72</f>", "<f>wide</f>"), r"camera 'frame_00': <f> contains 'wide'; expected 1 numbers"),
         (("<f>72</f>", "<f>72</f><b2>5</b2>"), r"skew b2 = 5.0; expected 0"),
         (("<f>72</f>", "<f>72</f><p3>3</p3>"), r"has the term p3 = 3.0"),
         (("<cx>", "<cx><x>"), r"not valid XML \(mismatched tag"),
@@ -202,7 +202,7 @@ def test_a_folder_of_realityscan_is_a_capture(tmp_path):
     [
         (HEADER + "\na.png,x,2\n", r"line 2: x is 'x'; expected a number"),
         (HEADER + "\n,1,2\n", r"line 2: it names no image"),
-        (HEADER + "\na.png,1,2,3,0,0,0,35\n", r"line 2: it ends before px: the file is cut"),
+        (HEADER + "\na.png,1,2,3,0,0,0,35\n", r"line 2: it ends before px: it is truncated"),
         ("#name,x,y\na.png,1,2\n", r"has no column 'alt'"),
         (HEADER + "\n", r"none of its 0 cameras has a pose"),
         (HEADER + "\na.png" + 15 * ",0" + "\n", r"line 2: camera intrinsics .* finite numbers, with fx and fy"),

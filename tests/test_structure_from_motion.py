@@ -111,7 +111,7 @@ def test_photographs_that_share_nothing_say_what_to_do(tmp_path, capsys):
         write_image(tmp_path / "p" / f"{index}.png", random.integers(0, 256, (60, 80, 3)).astype(np.uint8))
     assert main(["poses", str(tmp_path / "p"), "-o", str(tmp_path / "c")]) == 2
     said = capsys.readouterr().err
-    assert "0 of 4 photographs found their place; expected half of them at least: take more photographs" in said
+    assert "0 of 4 photographs could be aligned; expected at least half of them: take more photographs" in said
     assert len(said.splitlines()) == 1, said
     assert not (tmp_path / "c" / "sparse").exists()
     assert not (tmp_path / "c" / "images").exists()
@@ -123,7 +123,7 @@ def test_too_few_photographs_and_a_missing_library(tmp_path, monkeypatch):
     for index in range(3):
         write_image(tmp_path / "images" / f"{index}.png", np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "other" / "images").mkdir(parents=True)
-    with pytest.raises(SceneError, match=r"images holds other images than .*name another folder"):
+    with pytest.raises(SceneError, match=r"images has other images than .*name another folder"):
         find_poses(tmp_path, tmp_path / "other")
     (tmp_path / "other" / "images").rmdir()
     (tmp_path / "other").rmdir()

@@ -38,8 +38,8 @@ def test_a_file_that_names_no_space_is_unknown(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"names": None}, "lacks 1 of 2 arrays, 'names'"),
-        ({"vectors": None}, "lacks 1 of 2 arrays, 'vectors'"),
+        ({"names": None}, "lacks 1 of 2 arrays, e.g. 'names'"),
+        ({"vectors": None}, "lacks 1 of 2 arrays, e.g. 'vectors'"),
         ({"names": np.array(["a", "a"])}, "'a' is given twice"),
         ({"names": np.array(["a", " "])}, "row 1 has an empty name"),
         ({"names": np.array([1, 2])}, "names are int64"),

@@ -266,7 +266,7 @@ def test_a_las_file_whose_scales_collapse_or_mirror_it(tmp_path, scale):
     data = bytearray((tmp_path / "a.las").read_bytes())
     data[131:155] = struct.pack("<3d", scale, 1e-3, 1e-3)
     (tmp_path / "a.las").write_bytes(data)
-    with pytest.raises(SceneError, match=r"its scale factors are .*; expected 3 above 0"):
+    with pytest.raises(SceneError, match=r"its scale factors are .*; expected 3 numbers above 0"):
         read_points(tmp_path / "a.las")
 
 
@@ -365,7 +365,7 @@ def test_what_is_no_file_is_not_replaced(tmp_path, kind):
     os.mkfifo(pipe)
     {"folder": path.mkdir, "pipe": lambda: pipe.rename(path), "link to a pipe": lambda: path.symlink_to(pipe)}[kind]()
     before = path.lstat()
-    with pytest.raises(OgPointcloudError, match=r"'.*path' is a folder or a device; expected a file's name"):
+    with pytest.raises(OgPointcloudError, match=r"'.*path' is a folder or a device; expected the path of a file"):
         write_json(path, {})
     assert path.lstat() == before
     assert not any(tmp_path.glob(".*"))
@@ -406,7 +406,7 @@ def test_a_disk_that_is_full_while_a_command_writes(bundle, tmp_path, capsys, mo
         assert main([name, str(bundle), *rest]) == 2
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert re.fullmatch(rf"error: '?{rest[1]}'?: File too large, it was not written.*\n", capsys.readouterr().err)
+    assert re.fullmatch(rf"error: '?{rest[1]}'?: File too large; the file was not written.*\n", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -642,7 +642,7 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     (tmp_path / "2.TIF").write_bytes(b"")
     assert [file.name for file in numbered_images(tmp_path)] == ["2.TIF"]
     for path in (tmp_path / "poses.txt", Path("/dev/null")):
-        with pytest.raises(SceneError, match="is no file; expected a text file"):
+        with pytest.raises(SceneError, match="is not a file; expected a text file"):
             read_numbers(path, 17)
     og.write_bundle(room(), tmp_path / "scans" / "a.ogpc")
     os.mkfifo(tmp_path / "scans" / "b.ogpc")
@@ -675,7 +675,7 @@ def test_a_state_that_holds_something_else(tmp_path):
 def test_links_to_nowhere_are_told_before_the_work(tmp_path):
     for k in range(3):
         write_image(tmp_path / f"photographs/{k}.png", np.zeros((20, 20, 3), np.uint8))
-    for name, cause in (("sparse", "sparse is there already"), ("images", "holds other images")):
+    for name, cause in (("sparse", "sparse already exists"), ("images", "has other images")):
         target = tmp_path / f"with {name}"
         target.mkdir()
         (target / name).symlink_to(tmp_path / "nowhere")

@@ -40,7 +40,7 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise OgPointcloudError(f"'{path}' is a folder or a device; expected a file's name, new or to be replaced")
+        raise OgPointcloudError(f"'{path}' is a folder or a device; expected the path of a file to create or replace")
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
     temporary = _temporary(path)
@@ -57,7 +57,7 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
             _sync_folder(path.parent)
     except OSError as error:
         if error.filename is None and error.errno is not None:
-            raise OSError(error.errno, f"{error.strerror}, it was not written", str(path)) from error
+            raise OSError(error.errno, f"{error.strerror}; the file was not written", str(path)) from error
         raise
     finally:
         temporary.unlink(missing_ok=True)  # if it has not replaced the path
@@ -126,8 +126,8 @@ def _lock_file(folder: Path) -> IO[str]:
             file = (folder / LOCK).open("a+")
         except OSError as error:
             raise OgPointcloudError(
-                f"the work folder '{folder}' cannot be used ({error.strerror}); expected one that can be written to: "
-                "name another"
+                f"the work folder '{folder}' cannot be used ({error.strerror}); expected a writable folder: name "
+                "another"
             ) from error
         if not _hold(file):
             file.seek(0)

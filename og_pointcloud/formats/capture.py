@@ -189,8 +189,8 @@ def _recording(capture: Path) -> PosedFrames:
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), Metashape's .xml or RealityScan's .csv of cameras, or the layout "
         "of ScanNet (color/, pose/, intrinsic/), 7-Scenes (frame-*.pose.txt), Replica (results/, traj.txt), Polycam "
-        "(keyframes/), 3D Scanner App (frame_*.json), ARKitScenes (lowres_wide.traj) or KITTI-360 (data_poses/); of an "
-        "E57 file, og-pointcloud import makes such a folder, of photographs without poses og-pointcloud poses"
+        "(keyframes/), 3D Scanner App (frame_*.json), ARKitScenes (lowres_wide.traj) or KITTI-360 (data_poses/); "
+        "og-pointcloud import makes such a folder from an E57 file, og-pointcloud poses from photographs without poses"
     )
 
 
@@ -290,8 +290,8 @@ def _read_masks(capture: Path, names: Sequence[str], level: str | None) -> tuple
     if (capture / FEATURES_NAME).is_file():
         if level is not None:
             raise SceneError(
-                f"mask level is '{level}', but the masks of {capture} ({FEATURES_NAME}) have no levels; expected none: "
-                f"leave it out, or move {FEATURES_NAME} away to read {LANGUAGE_FEATURES_FOLDER}/ where there is one"
+                f"mask level is '{level}', but the masks of {capture} ({FEATURES_NAME}) have no levels; expected no "
+                f"level: leave it out, or move {FEATURES_NAME} away to read {LANGUAGE_FEATURES_FOLDER}/ instead"
             )
         return read_masks(capture, names)
     if (capture / LANGUAGE_FEATURES_FOLDER).is_dir():
@@ -325,7 +325,7 @@ def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | No
         return _fused(capture, frames).points
     if poses.source != model:  # tools rotate, shift or scale COLMAP's world, and seldom state how
         raise SceneError(
-            f"{poses.source} names no cloud, and the world of {model}/points3D may be another than that of its poses; "
+            f"{poses.source} names no cloud, and the world of {model}/points3D may differ from that of its poses; "
             f"expected a cloud in the world of {poses.source.name}: add {CLOUD_NAMES[0]}, or remove "
             f"{poses.source.name}, so that COLMAP's poses are used"
         )
@@ -339,8 +339,8 @@ def _inside(capture: Path, path: str, source: Path) -> Path:
     file = capture / relative
     if relative.startswith(("/", "..")) or not file.is_file():
         raise SceneError(
-            f"{source}: ply_file_path is '{path}', which is no file inside the capture folder; expected one: copy the "
-            "cloud there and fix the path, or name the file (--gaussians)"
+            f"{source}: ply_file_path is '{path}', which is not a file inside the capture folder; expected one: copy "
+            "the cloud there and fix the path, or name the file (--gaussians)"
         )
     return file
 
@@ -426,7 +426,7 @@ def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None
 
 
 def _require_shape(name: str, layer: MaskLayer, camera: Camera) -> None:
-    cure = "make the masks on the posed images or fix w and h of the pose file"
+    cure = "make the masks on the posed images or fix w and h in the pose file"
     require_scaled(f"view '{name}': the masks are", layer.size, (camera.width, camera.height), cure)
 
 

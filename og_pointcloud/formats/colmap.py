@@ -73,8 +73,8 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
     for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text):
         if camera_id in cameras:
             raise SceneError(
-                f"{model}: two cameras have the id {camera_id}; expected files of one reconstruction, not of two put "
-                "together: export the model again"
+                f"{model}: two cameras have the id {camera_id}; expected files from one reconstruction, not from two: "
+                "export the model again"
             )
         cameras[camera_id] = _camera(camera_model, size, values)
     images = []
@@ -82,7 +82,7 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
         if camera_id not in cameras:
             raise SceneError(
                 f"{model}: image '{name:.60}' has camera {camera_id}, but the cameras file has only "
-                f"{sorted(cameras)[:10]}; expected files of one reconstruction: export the model again"
+                f"{sorted(cameras)[:10]}; expected files from one reconstruction: export the model again"
             )
         with naming(f"{model}, image '{name:.60}'"):
             camera_at, lens = cameras[camera_id]
@@ -144,7 +144,7 @@ def _cameras_text(file: Path) -> Iterator[CameraRecord]:
         if len(line.split()) > 4 + len(names):  # for example if the model's name is wrong
             raise SceneError(
                 f"{place}: a {camera_model} with more than {len(names)} parameters; expected {', '.join(names)}: name "
-                "the model that they are of"
+                "the model they belong to"
             )
         values = _numbers(float, words[4 : 4 + len(names)], place)
         yield camera_id, camera_model, (size[0], size[1]), dict(zip(names, values, strict=True))
@@ -155,7 +155,7 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
     for place, line, lines in _lines(file):
         words = [*line.split(None, 9), *[""] * 10]
         if not words[9].strip():
-            raise SceneError(f"{place}: found '{line.strip():.60}'; expected ten fields, a name last: export it again")
+            raise SceneError(f"{place}: found '{line.strip():.60}'; expected ten fields, name last: export it again")
         _, camera_id = _numbers(int, [words[0], words[8]], place)
         yield _numbers(float, words[1:8], place), camera_id, words[9].strip()
         number, observations = next(lines, (0, ""))

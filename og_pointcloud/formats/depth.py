@@ -123,19 +123,17 @@ def _stored(file: Path) -> NDArray:
     if suffix not in DEPTH_SUFFIXES:
         raise SceneError(f"{file} ends in '{suffix}'; expected a depth image: {', '.join(DEPTH_SUFFIXES)}")
     if not file.is_file():
-        raise SceneError(f"{file} is listed as a depth image but is no file: add it or fix the pose file")
+        raise SceneError(f"{file} is listed as a depth image but is not a file: add it or fix the pose file")
     if suffix == ".npy":
         values = mapped_array(file)
         if values.size > MAX_PIXELS:
-            raise SceneError(
-                f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels"
-            )
+            raise SceneError(f"{file} has {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels")
     else:
         header = png_header(file)
         if header is not None and (header.bit_depth != 16 or header.color_type != 0):
             raise SceneError(
-                f"{file} is a PNG of {header.bit_depth} bit and color type {header.color_type}; expected gray of 16 "
-                "bit: pictures of depth in colors or 8 bit have lost the lengths"
+                f"{file} is a PNG with {header.bit_depth} bits and color type {header.color_type}; expected 16-bit "
+                "gray: depth images in color or 8 bits have lost the lengths"
             )
         values = decoded(file, require_cv2().IMREAD_UNCHANGED)
     if values.ndim == 3 and values.shape[-1] == 1:  # a channel axis of one
@@ -143,7 +141,7 @@ def _stored(file: Path) -> NDArray:
     kind = values.dtype.kind
     if values.ndim != 2 or not (kind == "f" or (kind in "iu" and values.dtype.itemsize > 1)) or not values.size:
         raise SceneError(
-            f"{file} is {values.dtype} {values.shape}; expected (height, width) of floats or of whole numbers of 16 "
-            "bit and more"
+            f"{file} is {values.dtype} {values.shape}; expected (height, width) floats, or whole numbers of 16 bits or "
+            "more"
         )
     return values

@@ -69,7 +69,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
     path, folder = Path(path), Path(folder)
     if (folder / "images").is_symlink():
         raise SceneError(
-            f"{folder / 'images'} is a link; expected none, as nothing is written through links: remove it"
+            f"{folder / 'images'} is a link, and nothing is written through links; expected a folder: remove it"
         )
     points = read_e57(path)
     frames, unused = [], []
@@ -82,7 +82,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
                 unused.append(f"{name:.60}: {error}")
         if not frames:
             why = unused[0] if unused else "the file has no images"
-            raise SceneError(f"no image of it can be used ({why}); expected pinhole or spherical ones with poses")
+            raise SceneError(f"none of its images can be used ({why}); expected pinhole or spherical ones with poses")
     write_ply(folder / "points.ply", {"vertex": plain_rows(points.xyz_world, points.rgb)})
     write_json(folder / "transforms.json", {"ply_file_path": "points.ply", "frames": frames})
     return len(frames), unused
@@ -220,7 +220,7 @@ def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, A
 def _blob(shown: Any, most: int) -> tuple[str, bytes]:
     kind = next((kind for kind in ("jpeg", "png") if shown.isDefined(f"{kind}Image")), None)
     if kind is None:
-        raise SceneError("it holds no JPEG or PNG")
+        raise SceneError("it contains no JPEG or PNG")
     blob = shown[f"{kind}Image"]
     size = blob.byteCount()
     if not 0 < size <= most:
@@ -241,7 +241,7 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
     if stated_size(io.BytesIO(data), "its image") == size:  # a small file may unpack to gigabytes
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
-        raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")
+        raise SceneError("its JPEG or PNG is damaged, or its size is not the one the file states")
     # The sphere is twice as wide as high; the image takes its part of the height, in the middle.
     whole = width // 2 * 2, width // 2
     shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))

@@ -146,7 +146,7 @@ def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
     seen = {name: _seen_box(name, whole, lens, 1.0) for name in CUBE}
     boxes = {name: box for name, (box, share) in seen.items() if box is not None and share > MIN_FACE_SHARE}
     if "front" not in boxes:
-        raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing before the camera: check the pose file")
+        raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing in front of it: check the pose file")
     return boxes
 
 

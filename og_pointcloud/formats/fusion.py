@@ -363,8 +363,8 @@ def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
     if shares[best] <= shares[1.0] + MIN_UNIT_GAIN:
         return _disagreement(images, max(shares.values()))
     return (
-        f"the views' depths agree in {shares[1.0]:.0%} of places, and in {shares[best]:.0%} if all depths are taken "
-        f"times {best:g}: give the depth unit (og-pointcloud fuse --depth-unit, or integer_depth_scale in "
+        f"the views' depths agree in {shares[1.0]:.0%} of places, and in {shares[best]:.0%} if all depths are "
+        f"multiplied by {best:g}: state the depth unit (og-pointcloud fuse --depth-unit, or integer_depth_scale in "
         "transforms.json)"
     )
 
@@ -375,9 +375,9 @@ def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
     if share >= MIN_AGREEING_SHARE or not roughly < MIN_SAME_SURFACE_SHARE:  # also where no views overlap
         return None
     return (
-        f"the views' depths agree in {share:.0%} of places, whatever the unit (right ones in half of them): poses "
-        "(axes, direction, order) or intrinsics are wrong, or the images hold something other than depths along the "
-        "optical axis (lengths of rays, disparities, another frame's depths)"
+        f"the views' depths agree in {share:.0%} of places, whatever the unit (correct depths agree in half of them): "
+        "poses (axes, direction, order) or intrinsics are wrong, or the images contain something other than depths "
+        "along the optical axis (lengths of rays, disparities, another frame's depths)"
     )
 
 

@@ -103,7 +103,7 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
     """Attributes of KHR_gaussian_splatting: quaternions x y z w, linear scales, opacity, the constant harmonic."""
     scale, rotation, opacity = splats.gaussians
     if len(splats) != len(rgb):
-        raise SceneError(f"{len(splats)} Gaussians for {len(rgb)} labels; expected as many")
+        raise SceneError(f"{len(splats)} Gaussians for {len(rgb)} labels; expected one label per Gaussian")
     columns = {
         "ROTATION": rotation[:, [1, 2, 3, 0]],  # from w x y z
         "SCALE": scale,

@@ -163,13 +163,13 @@ def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def require_scaled(
-    what: str, size: tuple[int, int], camera: tuple[int, int], cure: str = "fix the width and height of the pose file"
+    what: str, size: tuple[int, int], camera: tuple[int, int], cure: str = "fix the width and height in the pose file"
 ) -> None:
     """SceneError, which begins with ``what``, where a size (width, height) is not its camera's, up to scale."""
     if not same_shape(size, camera):
         raise SceneError(
-            f"{what} {size[0]}x{size[1]} pixels, its camera {camera[0]}x{camera[1]}; expected the same size or a "
-            f"scaled one: {cure}"
+            f"{what} {size[0]}x{size[1]} pixels, its camera {camera[0]}x{camera[1]}; expected the same aspect ratio: "
+            f"{cure}"
         )
 
 

@@ -55,7 +55,7 @@ def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
 
 def find_static_cloud(folder: Path) -> Path | None:
     """The accumulated cloud, or None; SceneError for several, as each covers only some of the frames."""
-    return the_only(folder, "data_3d_semantics/*/*/static/*.ply", "static clouds, each of some frames,")
+    return the_only(folder, "data_3d_semantics/*/*/static/*.ply", "static clouds, each covering some frames")
 
 
 def _images_folder(folder: Path, drive: str, camera: str) -> Path:

@@ -88,7 +88,7 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
     levels = mapped_array(file)
     if levels.ndim != 3 or len(levels) != len(LEVELS) or levels.dtype.kind not in "iuf":
         raise SceneError(
-            f"{file} is {levels.dtype} {levels.shape}; expected numbers (4, height, width), one map a level: "
+            f"{file} is {levels.dtype} {levels.shape}; expected numbers (4, height, width), one map per level: "
             f"{', '.join(LEVELS)}"
         )
     index = LEVELS.index(level)
@@ -96,12 +96,12 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
     with np.errstate(invalid="ignore"):
         ids = stored.astype(np.int32)
     if (ids != stored).any():
-        raise SceneError(f"{file}: level '{level}' holds values that are no ids; expected whole numbers, -1 for none")
+        raise SceneError(f"{file}: level '{level}' has values that are not ids; expected whole numbers, -1 for none")
     # Id 0 is the first mask of the first level that has any. Equal levels share their rows.
     others = [other for other in levels[:index] if (other >= 0).any()] if (ids == 0).any() else []
     if not all(np.array_equal(other, stored) for other in others):
         raise SceneError(
-            f"{file}: the ids of level '{level}' start at 0 again; expected ids that count on from level to level, as "
+            f"{file}: the ids of level '{level}' start at 0 again; expected ids that continue from level to level, as "
             "LangSplat writes them, so that an id is a row of the features"
         )
     return np.maximum(ids, -1)

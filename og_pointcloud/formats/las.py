@@ -69,7 +69,7 @@ def read_las(path: StrPath) -> Points:
     with _opened(Path(path)) as reader:
         promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
         if not (scales > 0).all():  # 0 puts all points in one place; a negative scale mirrors them
-            raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
+            raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 numbers above 0: export it again")
         has_colors = "red" in reader.header.point_format.dimension_names
         for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
             xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
@@ -114,7 +114,7 @@ def write_las(
             except OSError:
                 raise
             except Exception as error:  # such as lazrs's error for a full disk
-                raise SceneError(f"it cannot be written ({error!s:.120}): is there room?") from error
+                raise SceneError(f"it cannot be written ({error!s:.120}): check the free space") from error
 
 
 def _is_las(path: StrPath) -> bool:
@@ -140,7 +140,7 @@ def _points_of(source: Path, count: int) -> LasData:
     with _opened(source) as reader:
         las = reader.read()
         if len(las.points) != count:
-            raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
+            raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the labelled file")
     degrees = getattr(las, "scan_angle_rank", None)
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
     if degrees is not None:  # laspy drops it: its name and unit differ in the new format
@@ -174,7 +174,7 @@ def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence
     laspy = _laspy()
     record = json.dumps(list(names)).encode()
     if len(record) > MAX_RECORD_BYTES:
-        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {MAX_RECORD_BYTES}: ask for fewer")
+        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS stores {MAX_RECORD_BYTES}: ask for fewer")
     las.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
     # All at once: laspy copies the points for each call.
     las.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])

@@ -152,7 +152,7 @@ def lens_of(model: str, values: Terms) -> Lens | None:
     if unknown:
         raise SceneError(
             f"a {model} lens has the term {unknown[0]} = {values[unknown[0]]}; expected only {', '.join(names)}: "
-            "undistort images and masks first and give pinhole cameras"
+            "undistort images and masks first, and state pinhole cameras"
         )
     terms = tuple(float(values.get(name, 0.0)) for name in names)
     if not np.isfinite(terms).all():
@@ -169,7 +169,7 @@ def spherical_camera(width: int, height: int, world_to_camera: DoubleArray) -> C
     """The camera of an equirectangular image of the whole sphere: its focal lengths are pixels per radian."""
     if not 1.9 < width / max(height, 1) < 2.1:
         raise SceneError(
-            f"an equirectangular image is {width}x{height}; expected twice as wide as high, all of the sphere: pad it "
+            f"an equirectangular image is {width}x{height}; expected twice as wide as high, the whole sphere: pad it "
             "with black to that shape"
         )
     return Camera(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, world_to_camera)

@@ -83,8 +83,8 @@ def require_all(files: Sequence[Path], cure: str) -> None:
         folder = missing[0].parents[0]
         names = ", ".join(file.name for file in missing[:3]) + (", ..." if len(missing) > 3 else "")
         raise SceneError(
-            f"{len(missing)} of {len(files)} posed images have no mask: {folder} lacks {names}; expected one an image: "
-            f"{cure}, or take the image out of the pose file"
+            f"{len(missing)} of {len(files)} posed images have no mask: {folder} lacks {names}; expected one per "
+            f"image: {cure}, or remove the image from the pose file"
         )
 
 
@@ -92,10 +92,10 @@ def _id_header(file: Path) -> PngHeader:
     header = png_header(file)
     is_gray = header is not None and header.color_type == GRAY and header.bit_depth in (8, 16)
     if header is None or not (is_gray or header.color_type == PALETTE):
-        found = f"a {PNG_COLOR_TYPES.get(header.color_type)} PNG of {header.bit_depth} bit" if header else "not a PNG"
+        found = f"a PNG, {header.bit_depth}-bit {PNG_COLOR_TYPES.get(header.color_type)}" if header else "not a PNG"
         raise SceneError(
-            f"{file} is {found}; expected a gray PNG of 8 or 16 bit, or one with a palette, whose values are mask ids "
-            "(0 none, 1..M): write ids instead of colors"
+            f"{file} is {found}; expected an 8-bit or 16-bit gray PNG, or one with a palette, whose values are mask "
+            "ids (0 none, 1..M): write ids instead of colors"
         )
     return header
 
@@ -136,7 +136,7 @@ def as_features(values: NDArray[Any], source: str) -> FloatArray:
         return np.zeros((0, values.shape[-1] if values.ndim == 2 else 0), np.float32)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):
         raise SceneError(
-            f"{source} features are {values.dtype} {values.shape}; expected floats of shape (masks, width)"
+            f"{source} features are {values.dtype} {values.shape}; expected floats of shape (masks, dimension)"
         )
     with np.errstate(over="ignore"):
         return values.astype(np.float32)

@@ -142,7 +142,7 @@ def _depth(capture: Path, keys: dict[str, Any], camera: Camera, lens: Lens | Non
         raise SceneError(f"depth_file_path is {path!r:.80}, which leads out of the capture folder: copy it there")
     unit = next((unit for key in DEPTH_UNIT_KEYS if (unit := _number(keys, key)) is not None), None)
     if unit is not None and unit <= 0:
-        raise SceneError(f"the depth unit is {unit}; expected lengths a stored step, above 0, such as 0.001")
+        raise SceneError(f"the depth unit is {unit}; expected world lengths per stored step, above 0, e.g. 0.001")
     return DepthFile(capture / inside, camera, unit, lens=lens)
 
 

@@ -35,7 +35,7 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
     except (ValueError, SyntaxError, tokenize.TokenError, TypeError, RecursionError) as error:  # from its parser
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
-        raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")
+        raise ValueError(f"it contains Python objects ({dtype}), which are never loaded")
     count = int(np.prod(shape, dtype=object))  # Python's integers do not overflow
     claimed, held = count * dtype.itemsize, len(data) - stream.tell()
     if any(length < 0 for length in shape) or claimed != held or (count and not dtype.itemsize):
@@ -45,7 +45,7 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
     # Otherwise numpy would raise an error later, without the file's name, when it makes strings of the numbers.
     if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CODE_POINT).any():
-        raise ValueError(f"it holds {dtype} text of characters that there are not")
+        raise ValueError(f"it contains {dtype} text with characters that do not exist")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
 
 
@@ -84,7 +84,7 @@ def read_npz(
             if (total := sum(info.file_size for info in held.values())) > max_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {max_bytes}")
             if total > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * file.stat().st_size):
-                raise ValueError(f"it unpacks to {total} bytes, {MAX_RATIO} times its own: it is made to fill memory")
+                raise ValueError(f"it unpacks to {total} bytes, {MAX_RATIO} times its size: it is made to fill memory")
             arrays = {name: _array_from_zip(archive, held[name]) for name in (*needed, *optional) if name in held}
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
         raise kind(
@@ -92,7 +92,7 @@ def read_npz(
         ) from None
     if missing := [name for name in needed if name not in arrays]:
         raise kind(
-            f"{file}: it lacks {len(missing)} of {len(needed)} arrays, '{missing[0]}' first (it has "
+            f"{file}: it lacks {len(missing)} of {len(needed)} arrays, e.g. '{missing[0]}' (it has "
             f"{', '.join(held) or 'nothing':.120}); expected {expected}"
         )
     return arrays
@@ -100,7 +100,7 @@ def read_npz(
 
 def _array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"a member is packed by method {info.compress_type}, which numpy does not use")
+        raise ValueError(f"a member is compressed by method {info.compress_type}, which numpy does not use")
     if info.header_offset + info.compress_size > archive.start_dir:
         raise ValueError(f"a member claims {info.compress_size} bytes, more than the file has")
     return array_from_npy(archive.read(info))

@@ -85,7 +85,7 @@ def _parse_header(head: bytes) -> _Header:
 def _dtype(entries: dict[str, list[str]]) -> np.dtype:
     names = [f"_{i}" if name == "_" else name for i, name in enumerate(entries.get("FIELDS", []))]
     if not names or len(set(names)) < len(names):
-        raise SceneError(f"PCD FIELDS are {' '.join(names)[:80]!r}; expected at least one name, each once")
+        raise SceneError(f"PCD FIELDS are {' '.join(names)[:80]!r}; expected at least one name, none twice")
     # COUNT may be left out; it is then 1 for all fields.
     sizes = _whole_numbers(entries, "SIZE", len(names))
     counts = _whole_numbers(entries, "COUNT", len(names)) if "COUNT" in entries else [1] * len(names)

@@ -76,7 +76,7 @@ def _reader(file: Path) -> Callable[[str, ImageSize], PosedFrames] | None:
 
 def _metashape(text: str, _: ImageSize) -> PosedFrames:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # a few nested entities unpack to gigabytes
-        raise SceneError("the XML defines entities; expected none, as Metashape writes it: export it again")
+        raise SceneError("the XML defines entities; expected none, as in Metashape's files: export it again")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -181,7 +181,7 @@ def _floats(element: ElementTree.Element, count: int) -> DoubleArray:
     except ValueError:
         values = np.empty(0)
     if len(values) != count or not np.isfinite(values).all():
-        raise SceneError(f"<{element.tag:.40}> holds '{' '.join(words[:4]):.60}'; expected {count} numbers")
+        raise SceneError(f"<{element.tag:.40}> contains '{' '.join(words[:4]):.60}'; expected {count} numbers")
     return values
 
 
@@ -231,7 +231,7 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
     for column in COLUMNS:
         text = line.get(column)
         if text is None and column in line:
-            raise SceneError(f"it ends before {column}: the file is cut, copy or export it again")
+            raise SceneError(f"it ends before {column}: it is truncated; copy or export it again")
         try:
             values[column] = float(text or 0)
         except (TypeError, ValueError):

@@ -88,7 +88,7 @@ def write_ply(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments:
             header.append(f"element {name} {len(rows)}")
             header += [f"property {PLY_TYPES[_numpy_type(rows, field)]} {field}" for field in rows.dtype.names or ()]
         if any("\n" in line or "\r" in line for line in header):
-            raise SceneError("a comment or name holds a line break; expected one line: split the comment")
+            raise SceneError("a comment or name contains a line break; expected one line: split the comment")
         with replacing(path) as file:
             file.write("\n".join([*header, "end_header", ""]).encode())
             for rows in packed.values():

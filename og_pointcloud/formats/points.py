@@ -63,11 +63,11 @@ def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_
     """(n,) bool, whether each point's coordinates are finite; warns where some are not, SceneError where none are."""
     placed = np.logical_and.reduce(np.isfinite(xyz), axis=1)
     if not placed.any():
-        rest = f", and {len(xyz)} that hold NaN or infinity" if len(xyz) else ""
+        rest = f", and {len(xyz)} that contain NaN or infinity" if len(xyz) else ""
         raise SceneError(f"the cloud has 0 points{rest}; expected at least one: check the geometry file")
     if missing := int((~placed).sum()):
         first = int(np.argmin(placed))
-        what = f"{missing} of {len(xyz)} points hold NaN or infinity (the first is row {first}): {then}"
+        what = f"{missing} of {len(xyz)} points contain NaN or infinity (the first is row {first}): {then}"
         warnings.warn(f"{path}: {what}", stacklevel=3)
     return placed
 
@@ -84,7 +84,7 @@ def _read(path: Path) -> Points | NDArray[np.void]:
             return gaussians_from_ply(elements)
         if "vertex" not in elements:
             raise SceneError(
-                "no element 'vertex' before the first with lists (faces); the file has "
+                "no element 'vertex' before the first one with lists (faces); the file has "
                 f"{', '.join(elements) or 'none':.200}: write the vertices first"
             )
         return elements["vertex"]
@@ -99,8 +99,7 @@ def _read(path: Path) -> Points | NDArray[np.void]:
     start = f"it starts with {head[:16]!r}" if head else "it is empty"
     raise SceneError(
         f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-        "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, an E57 or an SPZ: convert it"
-        " first"
+        "compressed), PCD (ascii, binary, binary_compressed), LAS, LAZ, COPC, E57 or SPZ file: convert it first"
     )
 
 

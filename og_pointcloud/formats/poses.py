@@ -239,7 +239,7 @@ def read_json_object(file: Path) -> dict[str, Any]:
     """As `read_json`, for a file that holds one object."""
     content = read_json(file)
     if not isinstance(content, dict):
-        raise SceneError(f"{file} holds {content!r:.40}; expected a JSON object: export or fetch it again")
+        raise SceneError(f"{file} contains {content!r:.40}; expected a JSON object: export or fetch it again")
     return content
 
 
@@ -247,7 +247,7 @@ def read_text(file: Path, most: int = MAX_TEXT_BYTES) -> str:
     """A text file of bounded size, in UTF-8; SceneError if it is longer, or not text."""
     try:
         if not file.is_file():
-            raise SceneError(f"{file} is no file; expected a text file")  # a device or a pipe never ends
+            raise SceneError(f"{file} is not a file; expected a text file")  # a device or a pipe never ends
         if (size := file.stat().st_size) > most:
             raise SceneError(f"{file} has {size} bytes; expected at most {most}: split it")
         return file.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark

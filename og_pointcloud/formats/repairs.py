@@ -89,7 +89,7 @@ class Repair:
         above = "" if kind is None or kind.may_be_negative else ", the last above 0"
         expected = kind and (", ".join(kind.words[:8]) or f"{kind.numbers} finite number(s){above}")
         raise SceneError(
-            f"'{text:.80}' is no repair; expected name=value with a name of {', '.join(sorted(KINDS))}"
+            f"'{text:.80}' is not a repair; expected name=value, name one of {', '.join(sorted(KINDS))}"
             f"{f'; {name} takes {expected}' if kind else ''} ('og-pointcloud repair --help' explains)"
         )
 

@@ -76,7 +76,7 @@ def _pose_in(file: Path) -> NDArray[np.float64]:
 def _matrix_in(file: Path, side: int) -> NDArray[np.float64]:
     matrix = read_numbers(file, side)
     if matrix.shape != (side, side):
-        raise SceneError(f"{file} is {matrix.shape}; expected a {side}x{side} matrix with fx, fy, cx, cy")
+        raise SceneError(f"{file} has shape {matrix.shape}; expected a {side}x{side} matrix with fx, fy, cx, cy")
     return matrix
 
 

@@ -149,7 +149,7 @@ def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
     table = int.from_bytes(data[HEADER.size : HEADER.size + 4], "little")
     start, columns = table + 16 * streams, []
     if streams < 5 or start > len(data):
-        raise SceneError(f"its table of {streams} columns at byte {table} does not fit: copy or export it again")
+        raise SceneError(f"its table of {streams} columns at byte {table} does not fit in it: copy or export it again")
     for number, size in enumerate(sizes[:5]):  # harmonics, the sixth, stay packed
         packed, claimed = struct.unpack_from("<QQ", data, table + 16 * number)
         frame = data[start : start + packed]
@@ -188,8 +188,8 @@ def _as_fixed_point(xyz: DoubleArray) -> tuple[Bytes, int]:
     extent = float(np.ptp(xyz, axis=0).max(initial=0.0))
     if bits < 0 or (extent > 0 and 2.0**-bits > MAX_STEP_SHARE * extent):
         raise SceneError(
-            f"positions reach {farthest:.4g} from 0 over an extent of {extent:.4g}, too far or too little for SPZ's 24 "
-            "bits: move the splats near 0, take a smaller unit, or write a .ply"
+            f"positions reach {farthest:.4g} from 0 over an extent of {extent:.4g}, which SPZ's 24 bits cannot "
+            "resolve: move the splats near 0, use a smaller unit, or write a .ply"
         )
     steps = np.rint(xyz * 2.0**bits).astype(np.int32)
     return np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8).reshape(-1, 9), bits

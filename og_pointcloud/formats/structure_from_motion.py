@@ -40,8 +40,8 @@ PAIRS_PER_CALL = 64
 """Small, as Ctrl-C and the progress bar wait for each call of COLMAP to end."""
 SEED = 0
 CURE = (
-    "take more photographs from more places, each sharing two thirds with the next, of textured and still things in "
-    "even light, or let the tool that took them export its poses"
+    "take more photographs from more positions, each overlapping the next by two thirds, of textured, motionless "
+    "objects in even light, or let the tool that took them export its poses"
 )
 
 
@@ -103,11 +103,11 @@ def _photographs(source: Path, target: Path) -> list[Path]:
     if len(files) < MIN_SIZE:
         raise SceneError(f"{source} has {len(files)} photographs; expected {MIN_SIZE} or more, there or in its images/")
     if os.path.lexists(target / MODEL_FOLDER):
-        raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
+        raise SceneError(f"{target / MODEL_FOLDER} already exists; expected none: remove it, or name another folder")
     images = target / "images"
     is_other = not images.exists() or not images.samefile(files[0].parent)
     if target != source and os.path.lexists(images) and is_other:
-        raise SceneError(f"{images} holds other images than {files[0].parent}; expected none: name another folder (-o)")
+        raise SceneError(f"{images} has other images than {files[0].parent}; expected none: name another folder (-o)")
     return files
 
 
@@ -195,7 +195,7 @@ def _require_enough(model: Any, files: Sequence[Path]) -> None:
     registered = 0 if model is None else model.num_reg_images()
     if registered < max(MIN_SIZE, MIN_POSED_SHARE * len(files)):
         raise SceneError(
-            f"{registered} of {len(files)} photographs found their place; expected half of them at least: {CURE}"
+            f"{registered} of {len(files)} photographs could be aligned; expected at least half of them: {CURE}"
         )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-LABEL_FINITE = "save as .ply or .npz, which can hold them, or label points[np.isfinite(points).all(axis=1)] alone"
+LABEL_FINITE = "save as .ply or .npz, which can store them, or label only points[np.isfinite(points).all(axis=1)]"
 """The cure if a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 
@@ -47,7 +47,7 @@ def naming(place: str | Path) -> Iterator[None]:
             raise
         raise SceneError(f"{place}: {error}") from error
     except OSError as error:
-        cure = "check the path, its permissions, and the room there"
+        cure = "check the path, its permissions, and the free space"
         raise SceneError(f"{place}: {error.strerror or error}: {cure}") from error
 
 
@@ -64,10 +64,10 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
             if first is not None:
                 rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
     except DeprecationWarning as error:
-        raise SceneError(f"{what}: a value is no whole number of the type that the header says") from error
+        raise SceneError(f"{what}: a value is not a whole number of the type that the header states") from error
     except ValueError as error:
         raise SceneError(
-            f"{what}: {error} (expected {len(dtype.names or ())} values a row, as the header says)"
+            f"{what}: {error} (expected {len(dtype.names or ())} values per row, as the header states)"
         ) from error
     if len(rows) < count:
         raise SceneError(

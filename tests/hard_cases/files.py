@@ -68,7 +68,7 @@ def cloud_that_claims_too_much() -> object:
         return read_points(path)
 
 
-@refuses(SceneError, "lacks view0.png", "expected one an image", "write an all-zero mask")
+@refuses(SceneError, "lacks view0.png", "expected one per image", "write an all-zero mask")
 def capture_without_a_mask_image() -> object:
     """A capture folder that lacks one of its mask images."""
     with tempfile.TemporaryDirectory() as folder:
