@@ -181,7 +181,9 @@ def test_language_features_are_found(capture):
 
 
 def test_a_mask_level_of_masks_without_levels_is_refused(capture):
-    with pytest.raises(SceneError, match=r"mask level is 'small', but the masks of .* have no levels; expected no level"):
+    with pytest.raises(
+        SceneError, match=r"mask level is 'small', but the masks of .* have no levels; expected no level"
+    ):
         read_capture(capture[0], mask_level="small")
 
 

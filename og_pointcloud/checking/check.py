@@ -122,9 +122,9 @@ def check_words(cloud: LabelledCloud) -> Check:
     best = cloud.instances.cosines(vocabulary.vectors).max(axis=1)
     # Cosines below -1 mean instances without a descriptor; the rest are scaled to units of 1 / sqrt(width).
     typical = float(np.median(best[best >= -1])) * float(np.sqrt(descriptors.shape[1]))
-    says = f"an instance's best word stands {typical:.1f} standard deviations of random vectors from chance"
+    says = f"an instance's best word scores {typical:.1f} standard deviations above random vectors"
     if typical < MIN_COSINE_DEVIATIONS:
-        return Check("words", "doubt", f"{says}: the words' vectors seem to be of another encoder than the masks'")
+        return Check("words", "doubt", f"{says}: the words seem to come from another encoder than the masks")
     return Check("words", "ok", says)
 
 
@@ -161,7 +161,7 @@ def _coordinates(points: Points) -> list[Check]:
         return []
     says = (
         f"they are float32, in steps of {step:.3g} at {coordinate(farthest)}, and points lie about {pitch:.2g} apart: "
-        "export them as double, or take an offset off cloud and poses before"
+        "export them as double, or subtract an offset from cloud and poses first"
     )
     return [Check("coordinates", "doubt", says)]
 
@@ -172,7 +172,7 @@ def _unreadable(sample: Sample, photographs: Photographs | None) -> list[Check]:
     given = [view for view in sample.views if view.image is not None and sample.rgb is not None]
     found = unreadable(view for view in given if view.name not in used)
     says = (
-        f"{len(found)} of {len(given)} that were asked for cannot be read, and say nothing: {found[0]}" if found else ""
+        f"{len(found)} of {len(given)} that were sampled cannot be read, and are not used: {found[0]}" if found else ""
     )
     return [Check("photographs", "doubt", says)] if found else []
 
@@ -186,11 +186,11 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     always = stated.share >= NEARLY_ALWAYS_SHARE and stated.compared >= MIN_VOUCHING_COMPARISONS
     # Of few views, others fit nearly as well.
     if stated.reaches(PHOTOGRAPHS_FIT) or always or stated.own >= SAME_CONTENT_CORRELATION:
-        return [Check("poses", "ok", f"drawings fit their own photographs best: {stated}")], photographs
+        return [Check("poses", "ok", f"renderings fit their own photographs best: {stated}")], photographs
     # Colors that do not come from photographs are no evidence against poses: judge by masks.
     if photographs.points_are_painted:
         return [_poses_by_masks(sample, maps)], None
-    misfit = f"drawn where the poses say, the cloud fits its own photographs no better than others ({stated})"
+    misfit = f"rendered at these poses, the cloud fits its own photographs no better than others ({stated})"
     if repairs := best_conversion(photographs):
         repaired = photographs.fit(photographs.sample.repaired(repairs))
         return [_doubt("poses", f"{misfit}: {SUSPECTS}", repairs, f"it does ({repaired})")], None
@@ -198,8 +198,8 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     agreement = _agreement(maps)
     if agreement.compared >= MIN_VOUCHING_COMPARISONS and agreement.reaches(MASKS_VOUCH):
         says = (
-            f"they fit the points' colors no better than other photographs ({stated}), though masks do: they are "
-            "turned, of another place or in another order (labels do not depend on them), or poses are off a little"
+            f"they fit the points' colors no better than other photographs ({stated}), but masks fit: they are turned, "
+            "of another place or in another order (labels do not depend on them), or poses are slightly off"
         )
         return [_agreed("poses", agreement), _doubt("photographs", says)], None
     return [_doubt("poses", f"{misfit}: {SUSPECTS}")], None
@@ -210,18 +210,18 @@ def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
     blind = sum(len(seen(sample.xyz, camera).rows) < enough for camera in sample.cameras)
     agreement = _agreement(maps)
     if blind > MAX_BLIND_SHARE * len(sample.cameras):
-        says = f"the cameras of {blind} of {len(sample.cameras)} views see next to nothing of the cloud"
+        says = f"the cameras of {blind} of {len(sample.cameras)} views see almost none of the cloud"
     elif agreement.compared < MIN_COUNT:
-        return Check("poses", "unchecked", "no photographs with colored points; masks are missing or share too little")
+        return Check("poses", "unchecked", "no photographs of colored points; masks are missing or overlap too little")
     elif _verdict(agreement) == "ok":
         return _agreed("poses", agreement)
     else:
-        says = f"masks of different views agree no better than others' masks ({agreement})"
+        says = f"masks of different views agree no better than unrelated masks ({agreement})"
     repairs = (best_conversion(maps) or best_mask_conversion(maps)) if maps else ()
     # Neither right nor wrong by the bounds, and no conversion helps: not doubted.
     if blind <= MAX_BLIND_SHARE * len(sample.cameras) and _verdict(agreement) == "unchecked" and not repairs:
         return _agreed("poses", agreement)
-    return _doubt("poses", f"{says}: {SUSPECTS}, or masks are of other images", repairs, "masks agree")
+    return _doubt("poses", f"{says}: {SUSPECTS}, or masks belong to other images", repairs, "masks agree")
 
 
 def _agreement(maps: MaskMaps | None) -> Comparison:
@@ -230,7 +230,7 @@ def _agreement(maps: MaskMaps | None) -> Comparison:
 
 def _agreed(name: str, found: Comparison) -> Check:
     verdict = _verdict(found)
-    agree = "agree" if verdict == "ok" else "agree too little to tell that they are right, and too much for wrong ones"
+    agree = "agree" if verdict == "ok" else "agree too little to be clearly right, and too much to be clearly wrong"
     return Check(name, verdict, f"masks of different views {agree}: {found}")
 
 
@@ -246,7 +246,7 @@ def _verdict(found: Comparison) -> Verdict:
 def _alignment(photographs: Photographs | None) -> Check:
     """Small faults: a shift, a turn, a scale or calibration that is a little off."""
     if photographs is None or len(photographs.images) < MIN_ALIGNED_VIEWS:
-        says = f"it takes {MIN_ALIGNED_VIEWS} photographs or more that fit the points' colors"
+        says = f"it needs at least {MIN_ALIGNED_VIEWS} photographs that fit the points' colors"
         return Check("alignment", "unchecked", says)
     registration, name = Registration(photographs, photographs.sample.cameras), "everything"
     change = registration.best_change(name)
@@ -257,7 +257,7 @@ def _alignment(photographs: Photographs | None) -> Check:
         change = registration.refined(name, change)
     less = 1 - change.error / max(registration.start.error, 1e-9)
     if suspicious and _is_fault(change, registration.start.error):
-        off = f"points lie {change.shift:.1%} of the width off"
+        off = f"points are off by {change.shift:.1%} of the width"
         says = f"photographs fit {less:.0%} better with {GROUPS[name].says}: {off}"
         return Check("alignment", "doubt", says, " ".join(map(str, registration.repair(name, change))))
     says = f"no small change of poses or calibration fits much better ({less:.0%}, {change.shift:.1%} of the width)"
@@ -283,16 +283,16 @@ def _is_fault(change: SmallChange, start: float) -> bool:
 def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
     whole = sum(np.bincount(ids.reshape(-1))[1:].max(initial=0) > WHOLE_IMAGE_SHARE * ids.size for ids in maps.ids)
     if whole > len(maps.ids) / 2:
-        says = f"one mask covers the whole image in {whole} of {len(maps.ids)} views: make masks of things"
+        says = f"one mask covers the whole image in {whole} of {len(maps.ids)} views: make one mask per object"
         return Check("masks", "doubt", says)
     if (blended := float(np.median(maps.blended))) > MAX_BLENDED_SHARE:
         says = (
-            f"{blended:.0%} of the borders hold an id between those of both sides: masks were resized with "
-            "interpolation, or stored with losses; expected ids as they were given: nearest neighbor, PNG"
+            f"{blended:.0%} of the borders have ids between those on either side: masks were resized with "
+            "interpolation, or compressed with losses; expected unchanged ids: nearest neighbor, PNG"
         )
         return Check("masks", "doubt", says)
     if is_doubted:  # with wrong poses, right masks disagree too
-        return Check("masks", "unchecked", "poses come first")
+        return Check("masks", "unchecked", "poses must be fixed first")
     agreement = _agreement(maps)
     if agreement.compared < MIN_COUNT:
         return Check("masks", "unchecked", "too few points are seen by two views with masks")
@@ -300,8 +300,8 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
     if _verdict(agreement) != "doubt" and not repairs:
         return _agreed("masks", agreement)
     says = (
-        f"where views see the same points, masks agree no better than others' ({agreement}): they are mirrored, "
-        "turned, or of other images"
+        f"where views see the same points, masks agree no better than unrelated masks ({agreement}): they are "
+        "mirrored, turned, or from other images"
     )
     return _doubt("masks", says, repairs, "they agree")
 
@@ -310,13 +310,13 @@ def _features(maps: MaskMaps, *, is_doubted: bool) -> Check:
     if doubt := _odd_rows(maps) or _unshown(maps):
         return doubt
     if not any(map(len, maps.features)):
-        return Check("features", "unchecked", "masks have none")
+        return Check("features", "unchecked", "masks have no features")
     if is_doubted:
-        return Check("features", "unchecked", "poses and masks come first")
+        return Check("features", "unchecked", "poses and masks must be fixed first")
     alike = maps.features_alike(maps.sample.cameras)
     if alike.compared < MIN_FEATURE_COMPARISONS:
-        return Check("features", "unchecked", "too few masks of different views show the same")
-    says = f"masks that show the same have the more similar ones in {alike}"
+        return Check("features", "unchecked", "too few masks of different views show the same object")
+    says = f"masks of the same object have the more similar features in {alike}"
     if alike.share >= MIN_FEATURE_SHARE:
         return Check("features", "ok", says)
     # The same with ids shifted by one: files that count masks from 0 give each mask its neighbor's row.
@@ -350,7 +350,7 @@ def _unshown(maps: MaskMaps) -> Check | None:
         return Check("features", "doubt", says, "masks=from-zero")
     missing = 1 - float(np.concatenate(shown).mean()) if shown else 0.0
     if sum(map(len, shown)) >= MIN_COUNT and missing > MAX_UNSHOWN_SHARE:
-        says = f"{missing:.0%} of the rows belong to no pixel: more rows than masks, or rows of another run"
+        says = f"{missing:.0%} of the rows belong to no pixel: more rows than masks, or rows from another run"
         return Check("features", "doubt", says)
     return None
 
@@ -359,23 +359,23 @@ def _observed(cloud: LabelledCloud, vouched: bool) -> Check:
     share = float((cloud.instance_ids == UNOBSERVED).mean()) if len(cloud) else 0.0
     says = f"{share:.0%} of the points are seen by no view"
     if share > MAX_UNOBSERVED_SHARE and not vouched:
-        return Check("points seen", "doubt", f"{says}: {SUSPECTS}, or the views show a small part")
+        return Check("points seen", "doubt", f"{says}: {SUSPECTS}, or the views show only a small part")
     return Check("points seen", "ok", says)
 
 
 def _instances(cloud: LabelledCloud) -> Check:
     ids, count = cloud.instance_ids, len(cloud.instances)
     if count == 0:
-        return Check("instances", "doubt", "none: masks contradict each other, or show no point")
+        return Check("instances", "doubt", "none: masks contradict each other, or show no points")
     largest = float(np.bincount(ids[ids >= 0], minlength=1).max() / max(len(ids), 1))
     says = f"the largest of {count} has {largest:.0%} of the points, {(ids == BACKGROUND).mean():.0%} are background"
     if largest > MAX_INSTANCE_SHARE and count > 1:
-        return Check("instances", "doubt", f"{says}: masks join what lies apart")
+        return Check("instances", "doubt", f"{says}: masks join separate objects")
     return Check("instances", "ok", says)
 
 
 def _space(cloud: LabelledCloud) -> Check:
     if cloud.feature_space == UNKNOWN_SPACE:
-        says = "nobody named the encoder of the masks: words of any encoder of that width are compared with them"
+        says = "the masks' encoder is unknown: words from any encoder of that dimension are compared with them"
         return Check("feature space", "unchecked", says)
     return Check("feature space", "ok", f"'{printable(cloud.feature_space, 80)}'")

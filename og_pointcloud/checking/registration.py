@@ -59,9 +59,9 @@ class Group(NamedTuple):
 GROUPS = {
     "focal": Group((7,), "another focal length"),
     "shifted": Group((8, 9), "another principal point"),
-    "lens": Group((10, 11), "a lens that bends otherwise (distortion corrected twice, or not at all)"),
+    "lens": Group((10, 11), "another lens distortion (it is corrected twice, or not at all)"),
     "aligned": Group(tuple(range(7)), "the cameras moved as a whole"),
-    "everything": Group(tuple(range(PARAMETER_COUNT)), "poses and calibration changed a little"),
+    "everything": Group(tuple(range(PARAMETER_COUNT)), "poses and calibration slightly changed"),
 }
 """Fewest parameters first; all but the last are repairs."""
 
