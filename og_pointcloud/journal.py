@@ -24,7 +24,7 @@ class LeftOut(Enum):
         "shapes of Gaussians", "scale, rotation and opacity of the Gaussians",
         "visibility is tested along the ray through each center",
     )
-    CHOICE_OF_SPLATS = "choice of splats", "choice of scale", "the file holds Gaussians"
+    CHOICE_OF_SPLATS = "choice of splats", "choice of scale", "the file has Gaussians"
     CHOICE_OF_SCALE = (
         "choice of scale", "choice of the points' size",
         "too few views can be compared here: points are drawn {scale:g} spacings large",

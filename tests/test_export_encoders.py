@@ -177,7 +177,7 @@ def test_what_a_text_encoder_needs(model_folder, tmp_path):
     with pytest.raises(OgPointcloudError, match=r"no place for the name; expected \{\}"):
         exporter.export_text_encoder(model_folder, tmp_path / "out", feature_space=SPACE, templates=["a photo"])
     (tmp_path / "model" / "tokenizer.json").unlink()
-    with pytest.raises(OgPointcloudError, match=r"holds no tokenizer; expected tokenizer\.json, or vocab\.json"):
+    with pytest.raises(OgPointcloudError, match=r"has no tokenizer; expected tokenizer\.json, or vocab\.json"):
         exporter.export_text_encoder(tmp_path / "model", tmp_path / "out", feature_space=SPACE)
     folder = write_model(tmp_path / "siglip", "siglip")
     (folder / "tokenizer_config.json").unlink()
@@ -193,7 +193,7 @@ def test_what_a_text_encoder_needs(model_folder, tmp_path):
 def test_an_export_that_fails_writes_nothing(model_folder, tmp_path, monkeypatch):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("years of work")
-    with pytest.raises(OgPointcloudError, match="holds other things than an encoder"):
+    with pytest.raises(OgPointcloudError, match="has other files than an encoder"):
         exporter.export_image_encoder(model_folder, tmp_path / "thesis", feature_space=SPACE)
     assert [path.name for path in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
     monkeypatch.setattr(exporter, "TOLERANCE", 0.0)

@@ -161,7 +161,7 @@ def write_image_encoder(folder: Path, model: ImageModel, tower: Any, about: dict
         check_graph(graph, encode.OPERATORS)
     except ValueError as error:
         raise OgPointcloudError(
-            f"the graph that torch {torch.__version__} wrote cannot be used ({error}): please report this model"
+            f"the graph that torch {torch.__version__} wrote cannot be used ({error}): report this model as a bug"
         ) from None
     manifest = {
         **_heading(encode.ENCODER),
@@ -203,7 +203,7 @@ def _onnx_graph(
         return program.model_proto.SerializeToString()
     except Exception:  # protobuf's own type
         raise OgPointcloudError(
-            f"the model has {weights / 1e9:.2f} GB of weights; expected less than 2 GB, all that one file may hold"
+            f"the model has {weights / 1e9:.2f} GB of weights; expected less than 2 GB, the limit of one file"
         ) from None
 
 
@@ -234,7 +234,7 @@ def _tokenizer_of(source: Path, is_causal: bool) -> dict[str, Any]:
         tokenizer: Any = CLIPTokenizer.from_pretrained(source, local_files_only=True)
         return json.loads(tokenizer.backend_tokenizer.to_str())
     raise OgPointcloudError(
-        f"{source} holds no tokenizer; expected tokenizer.json{', or vocab.json and merges.txt,' if is_causal else ''} "
+        f"{source} has no tokenizer; expected tokenizer.json{', or vocab.json and merges.txt,' if is_causal else ''} "
         "beside the weights"
     )
 
@@ -268,7 +268,7 @@ def _pad_id(source: Path, description: dict[str, Any]) -> int:
     if id is None or config.get("padding_side", "right") != "right":
         raise OgPointcloudError(
             f"{file} has pad_token {token!r:.40}, padding_side {config.get('padding_side')!r:.20}; expected a token of "
-            "the vocabulary, on the right, since this model reads texts filled up to its context: write both there"
+            "the vocabulary, and padding on the right, as this model reads texts padded to its context: set both there"
         )
     return id
 
@@ -310,8 +310,8 @@ def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict
     error = float(np.abs(got - expected).max())
     if not error <= TOLERANCE:
         raise OgPointcloudError(
-            f"the graph differs from torch by {error:.3g}; expected at most {TOLERANCE}: the weights may hold values "
-            "that leave float32; if not, please report this model"
+            f"the graph differs from torch by {error:.3g}; expected at most {TOLERANCE}: the weights may contain "
+            "values beyond float32; if not, report this model as a bug"
         )
     cosine = float((got.astype(np.float64) * expected).sum(axis=1).min())
     return {"max_abs_error": error, "min_cosine": cosine, "torch": torch.__version__}
@@ -341,7 +341,7 @@ def _folder_name(feature_space: str) -> str:
 def _write_folder(folder: Path, files: Mapping[str, bytes], encoder: EncoderFormat) -> None:
     """Write a complete folder, replacing an encoder's if there is one; a folder with anything else in it is refused."""
     if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - encoder.files.keys()):
-        raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
+        raise OgPointcloudError(f"{folder} has other files than an encoder's; expected a new or an encoder's folder")
     with replacing_folder(folder, overwrite=True) as new:
         new.mkdir()
         for name, data in files.items():

@@ -84,7 +84,7 @@ def query_model(cloud: LabelledCloud) -> QueryModel:
         raise OgPointcloudError(
             f"query.onnx differs from float64: scores by {parity['instance_score_error']:.3g} (expected at most "
             f"{SCORE_TOLERANCE}), {parity['certain_points_wrong']} certain points wrong (expected 0): descriptors must "
-            "be unit rows; if they are, please report this cloud"
+            "be unit rows; if they are, report this cloud as a bug"
         )
     return QueryModel(onnx, parity)
 

@@ -9,17 +9,17 @@ same table, `KINDS`, to find out which conventions a capture uses.
   direction=inverse     poses are world-to-camera where camera-to-world is read, or the reverse
   quaternions=xyzw      quaternions are stored x y z w where w x y z is read
   world=x,z,-y          the poses' world has other axes: its x, y, z are these axes of the cloud
-  scale=2.5             the poses' lengths times this are the cloud's
-  aligned=tx,ty,tz,rx,ry,rz,s   cameras moved as a whole: by t, in the cloud's unit, turned by the rotation vector r
-                        (degrees) and scaled by s about their mean center
+  scale=2.5             the poses' lengths must be multiplied by this to match the cloud's
+  aligned=tx,ty,tz,rx,ry,rz,s   all cameras are moved together by t, in the cloud's unit, turned by the rotation vector
+                        r (degrees) and scaled by s about their mean center
   frames=1              image i has the pose that is listed for image i + 1 (-1: i - 1)
   intrinsics=2          fx, fy, cx, cy belong to an image that is smaller by this factor
-  focal=1.5             fx and fy times this
-  center=swapped        cx and cy are exchanged; center=middle: the image's middle is meant
-  shifted=du,dv         cx and cy moved by these shares of width and height
-  lens=none             images and masks are free of distortion already
-  masks=mirrored        left and right exchanged; upside-down; turned: by 180 degrees
-  masks=next            image i has the mask and features of image i + 1; previous
+  focal=1.5             fx and fy must be multiplied by this
+  center=swapped        cx and cy are swapped; center=middle: they are the middle of the image
+  shifted=du,dv         cx and cy are moved by these shares of width and height
+  lens=none             images and masks are already undistorted
+  masks=mirrored        masks are mirrored left to right; upside-down; turned: by 180 degrees
+  masks=next            image i has the mask and features of image i + 1; previous: i - 1
   masks=from-zero       mask ids count from 0, as rows of features do
 """
 
