@@ -151,7 +151,7 @@ def test_frames_without_a_finite_pose_are_dropped_by_name(tmp_path):
     [
         ("{", "is not valid JSON"),
         ("[" * 100_000, "is not valid JSON"),
-        ("[]", r"holds \[\]; expected a JSON object"),
+        ("[]", r"contains \[\]; expected a JSON object"),
         ('{"frames": []}', "no list 'frames'"),
         ('{"frames": {}}', "no list 'frames'"),
         ('{"frames": [3]}', "frame 0 has file_path None"),
