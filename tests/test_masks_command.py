@@ -429,6 +429,20 @@ number = 3
 """
 
 
+def test_masks_of_an_installed_module_that_has_changed_are_made_again(tmp_path, monkeypatch):
+    installed = tmp_path / "site" / "installed_masks"
+    installed.mkdir(parents=True)
+    (installed / "__init__.py").write_text("")
+    (installed / "halves.py").write_text(OWN)
+    monkeypatch.syspath_prepend(str(installed.parent))
+    make_capture(tmp_path / "c", 2)
+    settings = MaskSettings(proposer="python:installed_masks.halves:Nothing", encoder=None)
+    assert make_masks(tmp_path / "c", settings, progress=False).masks == 0
+    assert make_masks(tmp_path / "c", settings, progress=False).done_before == 2
+    (installed / "halves.py").write_text(OWN.replace("class Nothing:", "Nothing = halves\nclass Something:"))
+    assert make_masks(tmp_path / "c", settings, progress=False).done_before == 0
+
+
 def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own_masks.py").write_text(OWN)

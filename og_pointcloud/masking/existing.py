@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import runpy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ def user_proposer(place: str) -> MaskProposer:
     if not name or not all(part.isidentifier() for part in module.split(".")):
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
-        file = user_file(place)
+        file = _local_file(module)
         # A file is run by its path, not imported: one called numpy.py does not shadow numpy.
         found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
     except Exception as error:  # the module may raise anything
@@ -100,9 +100,21 @@ def user_proposer(place: str) -> MaskProposer:
     raise SceneError(f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose")
 
 
-def user_file(place: str) -> Path:
-    """The path that the file of ``MODULE:NAME`` would have."""
-    return Path(f"{place.partition(':')[0].replace('.', '/')}.py")
+def user_source(place: str) -> list[Path]:
+    """The file that defines ``MODULE:NAME``; empty if there is none."""
+    module = place.partition(":")[0]
+    if (file := _local_file(module)).is_file():
+        return [file]
+    try:
+        spec = importlib.util.find_spec(module)
+    except Exception:  # a package may raise anything; `user_proposer` says what
+        return []
+    return [Path(spec.origin)] if spec is not None and spec.origin else []
+
+
+def _local_file(module: str) -> Path:
+    """The path that a module's file in the working directory would have."""
+    return Path(f"{module.replace('.', '/')}.py")
 
 
 def _user_error(error: Exception) -> str:

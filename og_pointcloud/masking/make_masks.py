@@ -30,7 +30,7 @@ from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
-from og_pointcloud.masking.existing import user_file
+from og_pointcloud.masking.existing import user_source
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
@@ -122,7 +122,7 @@ def _fingerprint(settings: MaskSettings) -> str:
     """A name for settings and the user's masks or code that they refer to: other work files are not reused."""
     of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
-    given = sorted(settings.folder.rglob("*")) if settings.folder else [user_file(place)] if kind == "python" else []
+    given = sorted(settings.folder.rglob("*")) if settings.folder else user_source(place) if kind == "python" else []
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
 
