@@ -217,7 +217,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.jpg"), "ends in .png"),
         (("fit", "capture", "-o", "s.ogpc", "--schedule-share", "0.1"), "--mode grouping, which has no schedule"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "paper", "--schedule-share", "-1"), "schedule_share is -1"),
-        (("import", "absent", "-o", "s.ogpc"), "is not a file; expected a result folder"),
+        (("import", "absent", "-o", "s.ogpc"), "is not a file; expected an OpenGaussian result folder"),
         (("edit", "remove", "s.ogpc", "--id", "3", "--id", "4", "-o", "o.ply"), "twice; expected once: --id K,L"),
         (("segment", "s.ogpc", "-o", "a.ply", "--output", "b.ply"), "--output is given twice"),
         (("fit", "capture", "-o", "s.ogpc", "--seed", "0", "--seed", "1"), "--seed is given twice"),

@@ -139,7 +139,7 @@ def test_a_word_is_never_asked_in_the_space_of_another_encoder(folder):
     found = collection.find("lamp", top=100)
     assert {finding.scene for finding in found} == {"ours"}
     assert len(found.not_asked) == 3
-    assert found.not_asked[0].startswith("1 scene of feature space 'another/encoder' could not be asked for 'lamp'")
+    assert found.not_asked[0].startswith("1 scene of feature space 'another/encoder' could not be searched for 'lamp'")
     found = collection.find("chair", top=100)
     assert {finding.scene for finding in found} == {"ours", "same name"}
     best = {finding.scene: finding.instance for finding in reversed(found)}
@@ -288,7 +288,7 @@ def test_tough_scenes(folder):
     found = indexed(folder, clouds).find("desk", top=100)
     assert [finding.scene for finding in found] == ["good"]
     (folder / "none").mkdir()
-    with pytest.raises(OgPointcloudError, match=r"holds no \.ogpc file"):
+    with pytest.raises(OgPointcloudError, match=r"has no \.ogpc files"):
         og.Collection.index(folder / "none", folder.parent / "atlas")
 
 
@@ -320,7 +320,7 @@ def test_hostile_atlases_are_refused(judged, tmp_path, change, cause):
     connection.close()
     with pytest.raises(OgPointcloudError, match=cause) as caught:
         og.Collection(path).find("chair")
-    assert str(caught.value).startswith(f"{path} is no atlas that can be used")
+    assert str(caught.value).startswith(f"{path} is not a usable atlas")
     assert "remove" not in str(caught.value)  # it may be another file of the user's
 
 
@@ -342,14 +342,14 @@ def test_a_schema_of_damaged_letters_is_refused(judged, tmp_path):
     """SQLite quotes them in its error, which Python cannot decode."""
     path = tmp_path / "atlas"
     path.write_bytes(judged[1].path.read_bytes().replace(b"NOT NULL", b"NOT NUL\xec"))
-    with pytest.raises(OgPointcloudError, match=r"is no atlas that can be used .*: give an atlas, or a new name"):
+    with pytest.raises(OgPointcloudError, match=r"is not a usable atlas .*: give og-pointcloud index an atlas"):
         og.Collection(path)
 
 
 def test_other_files_are_no_atlas(tmp_path):
     for content in (b"", b"text", b"SQLite format 3\0" + bytes(100)):
         (tmp_path / "atlas").write_bytes(content)
-        with pytest.raises(OgPointcloudError, match="no atlas that can be used"):
+        with pytest.raises(OgPointcloudError, match="not a usable atlas"):
             og.Collection(tmp_path / "atlas")
     with pytest.raises(OgPointcloudError, match="not a file"):
         og.Collection(tmp_path / "nothing")
@@ -368,7 +368,7 @@ def test_a_full_disk_leaves_nothing_of_a_new_atlas(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
     try:
-        with pytest.raises(OgPointcloudError, match="stays as it was"), Atlas.writing(tmp_path / "atlas") as atlas:
+        with pytest.raises(OgPointcloudError, match="is unchanged"), Atlas.writing(tmp_path / "atlas") as atlas:
             atlas.add_words(("",) * 2000, np.ones((2000, 1024), np.float32))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -443,7 +443,7 @@ def test_commands(folder, capsys, tmp_path):
     (folder / "bad" / "x.ogpc").write_bytes(b"x")
     assert "none of 1 file could be read" in error_of(capsys, "index", folder / "bad", "-o", tmp_path / "bad")
     for path in (folder / "bad" / "x.ogpc", folder / "nowhere"):
-        assert f"'{path}' is no folder" in error_of(capsys, "index", path, "-o", tmp_path / "bad")
+        assert f"'{path}' is not a folder" in error_of(capsys, "index", path, "-o", tmp_path / "bad")
     assert "<b>mug" in error_of(capsys, "find", atlas, "<b>mug", "--html", page)
     assert main(["find", atlas, "mug", "--html", str(page)]) == 0
     assert "file not found" in page.read_text()
@@ -476,14 +476,14 @@ def test_what_lance_has_of_an_atlas_that_changed_since_is_refused(folder, tmp_pa
     database.create_table.return_value.count_rows.return_value = 0
     monkeypatch.setattr("og_pointcloud.collection.lance._database", lambda uri: database)
     monkeypatch.setitem(sys.modules, "pyarrow", MagicMock())
-    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+    with pytest.raises(OgPointcloudError, match=r"the current .*: write it again with og-pointcloud index --lance"):
         og.Collection(atlas, lance=str(uri))
     write_lance(atlas, str(uri))
     monkeypatch.chdir(tmp_path)
     collection = og.Collection(atlas, lance="lance")
     og.write_bundle(scene(["bed"], 99), folder / "new.ogpc")
     index(folder, atlas, progress=False)
-    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+    with pytest.raises(OgPointcloudError, match=r"the current .*: write it again with og-pointcloud index --lance"):
         collection.find("bed")
 
 
@@ -510,9 +510,9 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
     capsys.readouterr()
     assert main(["find", atlas, "bed", "--lance", uri, "--json", "--top", "1"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 1
-    with pytest.raises(OgPointcloudError, match="is no folder; expected what og-pointcloud index --lance wrote"):
+    with pytest.raises(OgPointcloudError, match="is not a folder; expected one that og-pointcloud index --lance wrote"):
         og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")
     assert not (tmp_path / "other").exists()
     (tmp_path / "other").mkdir()
-    with pytest.raises(OgPointcloudError, match="as it is now: write it again with og-pointcloud index --lance"):
+    with pytest.raises(OgPointcloudError, match=r"the current .*: write it again with og-pointcloud index --lance"):
         og.Collection(atlas, lance=str(tmp_path / "other"))

@@ -110,7 +110,7 @@ def test_the_smallest_mask_and_none_at_all(encoder):
     assert encoder.embed(image, masks[:0]).shape == (0, encoder.width)
     with pytest.raises(SceneError, match="no pixel"):
         encoder.embed(image, np.zeros((1, 40, 33), bool))
-    with pytest.raises(SceneError, match="as large as the image"):
+    with pytest.raises(SceneError, match="the size of the image"):
         encoder.embed(image, masks[:, :20])
 
 
@@ -166,7 +166,7 @@ def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_pa
         files = {"image_encoder.onnx": (exported / "image_encoder.onnx").read_bytes()}
         return write_files(tmp_path / f"p{patch}", {"manifest.json": json.dumps(manifest | patch).encode(), **files})
 
-    with pytest.raises(OgPointcloudError, match=r"whole squares alone; .*export image makes of it today"):
+    with pytest.raises(OgPointcloudError, match=r"whole crops; .*newly exported .og-pointcloud export image"):
         open_encoder(changed({"patch": None}), "dense")
     with pytest.raises(OgPointcloudError, match="patch is 0; expected a whole number up to 32"):
         open_encoder(changed({"patch": 0}), "dense")
@@ -176,7 +176,7 @@ def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_pa
 
 def test_a_model_without_patches_is_refused(tmp_path):
     make_capture(tmp_path / "c", 1)
-    with pytest.raises(OgPointcloudError, match=r"encoder 'demo' has vectors of whole squares alone; .*crops"):
+    with pytest.raises(OgPointcloudError, match=r"encoder 'demo' only has vectors of whole crops; .*crops"):
         make_masks(tmp_path / "c", MaskSettings(features="dense"), progress=False)
     with pytest.raises(OgPointcloudError, match="features are 'thick'; expected one of crops, dense"):
         MaskSettings(features="thick")

@@ -119,7 +119,7 @@ def test_an_exported_folder_is_checked_before_it_runs(tmp_path):
     with pytest.raises(OgPointcloudError, match="checksum"):
         OnnxModel(exported(tmp_path / "e", "image_encoder.onnx", lambda data: data[:-1] + b"x"))
     for wrong, message in (
-        ({"schema_version": 2}, "expected 'og-image-encoder' 1"), ({"width": -1}, "width -1"), ({"crops": []}, "crops"),
+        ({"schema_version": 2}, "expected 'og-image-encoder' 1"), ({"width": -1}, "is -1"), ({"crops": []}, "crops"),
         ({"crops": [{"scale": 0.5}]}, "scale 1 to 8"), ({"preprocessing": {"size": 1e9}}, "mean"),
         ({"files": {}}, "image_encoder.onnx"),
     ):  # fmt: skip

@@ -87,7 +87,7 @@ def test_what_does_not_fit_is_refused():
     whole = np.ones((1, 50, 70), bool)
     with pytest.raises(SceneError, match="float64"):
         mask_crops(IMAGE / 255, whole, Crop(), 8)
-    with pytest.raises(SceneError, match="as large as the image"):
+    with pytest.raises(SceneError, match="the size of the image"):
         mask_crops(IMAGE, whole[:, :20], Crop(), 8)
     with pytest.raises(SceneError, match="no pixel"):
         mask_crops(IMAGE, ~whole, Crop(), 8)

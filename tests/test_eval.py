@@ -66,7 +66,7 @@ def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
     assert "gt.npz is not a file" in error_of(capsys, *bare)
     assert "none.ogpc is not a file" in error_of(capsys, "eval", "capture", fitted / "tiny", fitted / "none.ogpc")
     np.savez(tmp_path / "bare/gt.npz", names=np.array(NAMES), cls=np.zeros(3, int))
-    assert "points, the truth 3; expected the points of the truth" in error_of(capsys, *bare)
+    assert "points, the truth 3; expected the truth's points" in error_of(capsys, *bare)
 
 
 def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path):

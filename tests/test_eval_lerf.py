@@ -169,7 +169,7 @@ def test_frames_without_objects_and_objects_outside_the_image(data, capsys):
     assert best["miou"] == pytest.approx((1 + 1 / 2 + 1 / 9 + 3 / 4 + 0) / 5)
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("teatime"))
     assert row.split() == ["teatime", "0", *"-" * 4]
-    assert "no labelled object in any frame" in error_of(capsys, *command(data, "--scenes", "teatime"))
+    assert "no labeled object in any frame" in error_of(capsys, *command(data, "--scenes", "teatime"))
 
 
 def test_a_scene_without_instances_selects_nothing(data):
@@ -215,12 +215,12 @@ def test_a_missing_file_is_one_error(remove, text, data, capsys):
 
 def test_labels_that_fit_no_pose_are_refused(data, capsys):
     write_labels(data / "d", "teatime", "frame_00003", [("cup", outline(0, 0, 4))])
-    assert "is of frame 'frame_00003', of which" in error_of(capsys, *command(data))
+    assert "frame 'frame_00003' has none of the" in error_of(capsys, *command(data))
     ramen = command(data, "--scenes", "ramen")
     assert "has no labels of 'ramen'; it has figurines, teatime" in error_of(capsys, *ramen)
     camera = data / "d/figurines/sparse/0/cameras.txt"
     camera.write_text(camera.read_text().replace("20 10", "20 20"))
-    assert "expected one shape, scaled" in error_of(capsys, *command(data, "--scenes", "figurines"))
+    assert "expected the same aspect ratio" in error_of(capsys, *command(data, "--scenes", "figurines"))
 
 
 def test_gaussians_of_another_cloud_are_refused(data):

@@ -138,10 +138,10 @@ def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
                 export(folder, tmp_path / "out", **{"feature_space": SPACE, **options})
 
     refused(tmp_path, "has no config.json")
-    refused(changed(model_type="blip"), "model_type is 'blip'; expected clip, siglip")
+    refused(changed(model_type="blip"), "model_type is 'blip'; expected one of clip, siglip")
     refused(changed(quantization_config={"quant_method": "gptq"}), "quantized")
     refused(changed(text_config=3), "cannot be read")
-    refused(changed(), "pass --feature-space as your scenes name it", feature_space=None)
+    refused(changed(), "pass --feature-space with the name in your scenes", feature_space=None)
     folder = changed(auto_map={"AutoModel": "evil.Model"})
     (folder / "evil.py").write_text("open('was_run', 'w')")
     clip.load_model(folder)

@@ -85,7 +85,7 @@ def labelled(known: Known) -> LabelledCloud:
 
 
 def test_a_folder_is_no_scene() -> None:
-    with pytest.raises(SceneError, match=r"scene is a str; expected a Scene, as og\.read_capture\(FOLDER\) makes one"):
+    with pytest.raises(SceneError, match=r"scene is a str; expected a Scene, as og\.read_capture\(FOLDER\) returns"):
         fit("kitchen")  # pyright: ignore[reportArgumentType]
 
 

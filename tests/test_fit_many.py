@@ -209,7 +209,7 @@ def test_a_script_without_a_guard_is_told_and_does_not_run_once_more_in_each_pro
         "print('all done', fits[0].state)\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100)
-    assert "all work of a script, below if __name__ == '__main__':" in done.stderr
+    assert "work of the script, under if __name__ == '__main__':" in done.stderr
     assert done.stdout == "all done failed\n"
 
 

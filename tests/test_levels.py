@@ -147,5 +147,5 @@ def test_nothing_and_empty_masks():
 def test_proposals_are_checked():
     with pytest.raises(SceneError, match="expected bool"):
         Proposals(np.zeros((2, 3, 4), np.uint8), np.ones(2, np.float32))
-    with pytest.raises(SceneError, match="a finite one each"):
+    with pytest.raises(SceneError, match="a finite one per proposal"):
         Proposals(np.zeros((2, 3, 4), bool), np.full(2, np.nan, np.float32))

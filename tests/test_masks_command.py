@@ -460,7 +460,7 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
         "own_masks:none": "no proposer 'python:own_masks:none'",
         "no_module:bright": "no proposer 'python:no_module:bright'",
         "own_masks": "expected python:MODULE:NAME",
-        "own_masks:bright": "a mask proposer gave",
+        "own_masks:bright": "a mask proposer returned",
         "own_masks:broken": r"python:own_masks:broken failed \(ZeroDivisionError: division by zero\)",
         "own_masks:Broken": r"python:own_masks:Broken failed \(ZeroDivisionError: division by zero\)",
         "typo:x": r"no proposer 'python:typo:x' \(SyntaxError",
@@ -476,7 +476,7 @@ def test_settings_are_checked():
         MaskSettings(level="huge")
     with pytest.raises(OgPointcloudError, match="every is 0"):
         MaskSettings(every=0)
-    with pytest.raises(OgPointcloudError, match=r"words are 'chair'; expected a tuple of them, as \('chair',\)"):
+    with pytest.raises(OgPointcloudError, match=r"words are 'chair'; expected a tuple such as \('chair',\)"):
         MaskSettings(words="chair")  # pyright: ignore[reportArgumentType]
 
 

@@ -46,7 +46,7 @@ def test_nothing_to_score_is_nan():
 
 
 def test_arrays_of_other_lengths_are_refused():
-    with pytest.raises(OgPointcloudError, match=r"truth has shape \(3,\)"):
+    with pytest.raises(OgPointcloudError, match=r"truth is \(3,\)"):
         score_labels(np.zeros(4, int), np.zeros(3, int))
     with pytest.raises(OgPointcloudError, match=r"\(4,\) and \(3,\)"):
         adjusted_rand_index(np.zeros(4, int), np.zeros(3, int))

@@ -140,17 +140,17 @@ def with_value(values, at, value):
     [
         (
             changed("leaf_ind", lambda v: with_value(v, 5, LEAVES)),
-            "leaf_ind row 5 holds 12; expected numbers from 0 to 11",
+            "leaf_ind row 5 is 12; expected numbers from 0 to 11",
         ),
-        (changed("leaf_ind", lambda v: with_value(v, 7, -1)), "leaf_ind row 7 holds -1"),
+        (changed("leaf_ind", lambda v: with_value(v, 7, -1)), "leaf_ind row 7 is -1"),
         (changed("leaf_ind", lambda v: v[:-1]), r"expected integers of shape \(300,\)"),
         (changed("leaf_ind", lambda v: v + 0.5), "leaf_ind is float64"),
-        (changed("leaf_feat", lambda v: with_value(v, (4, 2), np.nan)), r"leaf_feat row 4 holds .*nan"),
-        (changed("leaf_feat", lambda v: v[0]), r"expected floats of shape \(leaves, width\)"),
-        (changed("leaf_score", lambda v: with_value(v, 1, np.inf)), "leaf_score row 1 holds inf"),
+        (changed("leaf_feat", lambda v: with_value(v, (4, 2), np.nan)), r"leaf_feat row 4 is .*nan"),
+        (changed("leaf_feat", lambda v: v[0]), r"expected floats of shape \(leaves, D\)"),
+        (changed("leaf_score", lambda v: with_value(v, 1, np.inf)), "leaf_score row 1 is inf"),
         (changed("leaf_score", lambda v: v[:5]), r"leaf_score is float32 \(5,\); expected numbers of shape \(12,\)"),
-        (changed("occu_count", lambda v: v - 5), "occu_count row 0 holds -3"),
-        (changed("occu_count", lambda v: v * 1e30), "occu_count row 0 holds 2e"),
+        (changed("occu_count", lambda v: v - 5), "occu_count row 0 is -3"),
+        (changed("occu_count", lambda v: v * 1e30), "occu_count row 0 is 2e"),
         (changed("occu_count", lambda v: v.astype(object)), "Python objects"),
         ({"leaf_feat": np.ones((2, 2))}, "lacks 3 of 4 arrays, e.g. 'leaf_score'"),
     ],
@@ -163,7 +163,7 @@ def test_bad_arrays_are_named(tmp_path, arrays, text):
 
 
 def test_missing_and_damaged_files_are_named(result, tmp_path):
-    with pytest.raises(SceneError, match="empty is not a file; expected a result folder"):
+    with pytest.raises(SceneError, match="empty is not a file; expected an OpenGaussian result folder"):
         read_opengaussian(tmp_path / "empty")
     data = (result / "cluster_lang.npz").read_bytes()
     (result / "cluster_lang.npz").write_bytes(data[: len(data) // 2])
@@ -175,7 +175,7 @@ def test_missing_and_damaged_files_are_named(result, tmp_path):
 
 
 def test_invisible_clouds_are_refused(result):
-    with pytest.raises(SceneError, match=r"none of 300 Gaussians has an opacity of 0.99 or more \(the largest is 0.88"):
+    with pytest.raises(SceneError, match=r"the 300 Gaussians has an opacity of 0.99 or more \(the largest is 0.88"):
         read_opengaussian(result, min_opacity=0.99)
 
 

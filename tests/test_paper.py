@@ -378,7 +378,7 @@ def test_progress_names_stage_step_total_and_loss(balls: Balls) -> None:
 
 
 def test_views_without_covered_masks_are_refused(balls: Balls) -> None:
-    with pytest.raises(SceneError, match="none of the 6 views has a mask that Gaussians cover"):
+    with pytest.raises(SceneError, match="none of the 6 views has a mask of which Gaussians cover"):
         train_features(balls.gaussians, balls.views, replace(SHORT, covered_share=1.1))
 
 

@@ -197,7 +197,7 @@ def test_rle_of_a_known_text():
     ("rle", "message"),
     [
         ({"size": [3, 3], "counts": [3, 3]}, "add up to 6"),
-        ({"size": [3, 3], "counts": [12, -3]}, "least -3"),
+        ({"size": [3, 3], "counts": [12, -3]}, "shortest -3"),
         ({"size": [3, 3], "counts": "33"}, "add up to 6"),
         ({"size": [3, 3], "counts": "3 3"}, "byte 32"),
         ({"size": [3, 3], "counts": "o" * 40}, "byte"),

@@ -160,7 +160,7 @@ def test_proposes_masks_of_the_images_size(folders, image, kind):
 
 def test_a_folder_of_another_model_is_refused(tmp_path):
     transformers.BertConfig().save_pretrained(tmp_path)
-    with pytest.raises(SceneError, match="model_type is 'bert'; expected sam"):
+    with pytest.raises(SceneError, match="model_type is 'bert'; expected one of sam"):
         open_proposer(f"sam:{tmp_path}")
 
 
@@ -183,7 +183,7 @@ def test_no_code_of_a_models_folder_runs(folders, image, tmp_path, kind):
     if kind == "sam":
         SamPredictor(tmp_path / "model").set_image(image)
     else:
-        with pytest.raises(SceneError, match="model_type is 'their_own'; expected sam"):
+        with pytest.raises(SceneError, match="model_type is 'their_own'; expected one of sam"):
             SamPredictor(tmp_path / "model")
     assert not ran.exists()
 

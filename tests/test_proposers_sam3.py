@@ -184,7 +184,7 @@ def test_the_same_folder_answers_points(folder):
 
 @pytest.mark.parametrize(("change", "says"), [
     ("tokenizer", "has no tokenizer.json"), ("other tokenizer", "gives ids up to"), ("words", "words with SAM 3"),
-    ("other proposer", "words are asked of proposer 'opencv'"), ("kind", "model_type is 'bert'; expected sam3"),
+    ("other proposer", "proposer 'opencv' is asked for words"), ("kind", "model_type is 'bert'; expected one of sam3"),
 ])  # fmt: skip
 def test_what_is_missing_is_named(folder, tmp_path, change, says):
     model = tmp_path / "model"

@@ -168,7 +168,7 @@ def test_a_low_one_is_said_with_its_cause(scene: Scene) -> None:
     assert cloud.reliability < 0.6
     (warning,) = [text for text in cloud.provenance["warnings"] if "reliab" in text]
     assert ", below 0.65: half of the views give " in warning
-    assert "do not lie where the poses say" in warning
+    assert "are not where the poses say" in warning
 
 
 def test_three_views_judge_nothing(scene: Scene) -> None:

@@ -77,7 +77,7 @@ def test_only_the_knobs_asked_for_are_tried():
         "default", "mode: fast", "neighbors: 12", "neighbors: 48",
     ]  # fmt: skip
     assert [setting.value for setting in settings_of(("grouping sample",))] == ["", "5,000", "20,000", "all"]
-    with pytest.raises(OgPointcloudError, match="'color' is no knob; expected one of views, mode"):
+    with pytest.raises(OgPointcloudError, match="'color' is not a knob; expected one of views, mode"):
         settings_of(("color",))
 
 
@@ -154,7 +154,7 @@ def test_a_capture_that_cannot_be_fitted_is_named_and_costs_no_other(subject, mo
     large = replace(subject, name="large", scene=replace(subject.scene, views=views))
     found = sweep([large, subject], [DEFAULT], progress=False)
     assert found.captures == ["capture"]
-    assert "large: 1,576 points take more memory" in found.failed["large"]
+    assert "large: 1,576 points need more memory" in found.failed["large"]
     with pytest.raises(OgPointcloudError, match=r"no capture could be fitted: large: .* report on a part"):
         sweep([large], [DEFAULT], progress=False)
 
@@ -177,7 +177,7 @@ def test_a_capture_that_cannot_be_judged_is_refused_at_once(folder, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(folder, other)
     np.savez(other / "gt.npz", names=np.array(NAMES), cls=np.zeros(3, int))
-    with pytest.raises(SceneError, match="the truth is of 3 points"):
+    with pytest.raises(SceneError, match="the truth has 3 points"):
         read_subject(other)
     shutil.copy(folder / "gt.npz", other / "gt.npz")
     words = dict(np.load(other / "text_features.npz"))
@@ -277,7 +277,7 @@ def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
 
 
 def test_bad_use_is_one_error(tmp_path, capsys):
-    assert "'color' is no knob" in error_of(capsys, "report", tmp_path, "--knob", "color")
+    assert "'color' is not a knob" in error_of(capsys, "report", tmp_path, "--knob", "color")
     for name in "ab":
         (tmp_path / name / "x").mkdir(parents=True)
     error = error_of(capsys, "report", tmp_path / "a" / "x", tmp_path / "b" / "x", "-o", tmp_path / "r")

@@ -409,5 +409,5 @@ def executor_of(kind: str) -> Iterator[Executor]:
 
 
 def test_a_worker_that_cannot_see_the_folder_says_so(tmp_path):
-    with pytest.raises(OgPointcloudError, match="one folder that all workers share"):
+    with pytest.raises(OgPointcloudError, match="a folder that all workers share"):
         _opened(tmp_path, "0")

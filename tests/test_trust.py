@@ -654,13 +654,13 @@ def test_pipes_and_devices_are_no_files(tmp_path):
 def test_a_log_of_others_is_left_as_it_is(tmp_path):
     """A torn record at the end of a map's log is cut off; so would be all of a file that is another's."""
     (tmp_path / "frames.log").write_bytes(b"somebody's frames")
-    with pytest.raises(OgPointcloudError, match="was not written by a map"):
+    with pytest.raises(OgPointcloudError, match="was not written by this version"):
         list(MapJournal(tmp_path, "nothing").changes())
     assert (tmp_path / "frames.log").read_bytes() == b"somebody's frames"
     (tmp_path / "link").mkdir()
     (tmp_path / "own.log").write_bytes(MAGIC)
     (tmp_path / "link" / "frames.log").symlink_to(tmp_path / "own.log")
-    with pytest.raises(OgPointcloudError, match="was not written by a map"):
+    with pytest.raises(OgPointcloudError, match="was not written by this version"):
         list(MapJournal(tmp_path / "link", "nothing").changes())
 
 
@@ -668,7 +668,7 @@ def test_a_state_that_holds_something_else(tmp_path):
     for value in (3, ("a", "b"), ["a"]):
         data = packed(value)
         (tmp_path / "map.state").write_bytes(RECORD_HEADER.pack(MAGIC, len(data), zlib.crc32(data)) + data)
-        with pytest.raises(OgPointcloudError, match="is damaged, or another version's: remove the folder"):
+        with pytest.raises(OgPointcloudError, match="is damaged or of another version: remove the folder"):
             MapJournal(tmp_path, "nothing").state()
 
 

@@ -198,8 +198,8 @@ class Collection:
             for word in set(names) - known.keys():
                 counts[word, group.family.feature_space] += len(query.scenes_of(group))
         not_asked = tuple(
-            f"{counted(count, 'scene')} of feature space '{space}' could not be asked for '{word}': its vector there "
-            "is not known"
+            f"{counted(count, 'scene')} of feature space '{space}' could not be searched for '{word}': its vector "
+            "there is unknown"
             for (word, space), count in sorted(counts.items())
         )
         return Findings((finding for _, finding in ranked[:top]), not_asked)
@@ -213,8 +213,8 @@ class Collection:
             fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
             if not fitting:
                 raise OgPointcloudError(
-                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected a name "
-                    f"or pattern of the scenes of {self.path} ({len(self.entries):,})"
+                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected the name "
+                    f"of a scene in {self.path} ({len(self.entries):,}), or a pattern"
                 )
             ids.update(self._by_name[name].id for name in fitting)
         if not ids:
@@ -315,10 +315,10 @@ def _finding(block: Block, row: int, word: str, score: float) -> Finding:
 
 def _unanswerable(word: str, asked: Sequence[Family]) -> OgPointcloudError:
     if not asked:
-        return OgPointcloudError("no scene has an instance with a feature: nothing can be asked; make masks first")
+        return OgPointcloudError("no scene has an instance with a feature: nothing can be searched; make masks first")
     known = {name for family in asked for name in family.words}
     return OgPointcloudError(
         f"'{word}' is not among the {len(known)} words of these scenes{did_you_mean(word, known, ' If not')}: give "
-        "text_features with its vector (--text-features), or, for any word at all, make the encoder once: "
+        "text_features with its vector (--text-features), or, for any word, export the encoder once: "
         f"{export_command(asked[0].feature_space)}"
     )

@@ -103,8 +103,8 @@ def fit_many(
     """
     if executor is None and getattr(current_process(), "_inheriting", False):  # as Python's own guard asks
         raise OgPointcloudError(
-            "fit_many is called while one of its own processes imports this script; expected it, and all work of a "
-            "script, below if __name__ == '__main__':"
+            "fit_many was called while one of its own processes imported this script; expected the call, and all other "
+            "work of the script, under if __name__ == '__main__':"
         )
     if isinstance(captures, (str, os.PathLike)):  # do not iterate over the letters of a path
         captures = [captures]
@@ -167,8 +167,8 @@ def _outputs(captures: Sequence[Path], out: Path) -> dict[Path, Path]:
     for capture in captures:
         if names.setdefault(capture.name, capture) != capture:
             raise OgPointcloudError(
-                f"'{names[capture.name]}' and '{capture}' would both become {capture.name}.ogpc; expected folders of "
-                "different names: fit them to two folders"
+                f"'{names[capture.name]}' and '{capture}' would both become {capture.name}.ogpc; expected folders "
+                "with different names: fit them into different folders"
             )
     return {capture: out / f"{name}.ogpc" for name, capture in names.items()}
 

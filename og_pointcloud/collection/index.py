@@ -60,10 +60,10 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     """
     root = Path(folder)
     if not root.is_dir():
-        raise OgPointcloudError(f"'{root}' is no folder; expected the one with what og-pointcloud fit wrote")
+        raise OgPointcloudError(f"'{root}' is not a folder; expected a folder of .ogpc files")
     files = {file.relative_to(root).with_suffix("").as_posix(): file for file in sorted(root.rglob("*.ogpc"))}
     if not files:
-        raise OgPointcloudError(f"'{root}' holds no .ogpc file; expected a folder with what og-pointcloud fit wrote")
+        raise OgPointcloudError(f"'{root}' has no .ogpc files; expected those that og-pointcloud fit wrote")
     added, replaced, left_out = [], [], []
     with Atlas.writing(path) as atlas:
         atlas.note("root", str(root.resolve()))
@@ -93,7 +93,7 @@ def _is_same(file: Path, entry: SceneEntry) -> bool:
 def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
     """Add a .ogpc file to the atlas; False if only its date is new, not its content."""
     if not file.is_file():
-        raise OgPointcloudError(f"{file} is no file; expected one")  # a device or a pipe never ends
+        raise OgPointcloudError(f"{file} is not a file; expected a .ogpc file")  # a device or a pipe never ends
     state = file.stat()
     digest = blake2b(file.read_bytes(), digest_size=16).hexdigest()
     if known is not None and known.digest == digest:

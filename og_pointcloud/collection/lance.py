@@ -83,14 +83,14 @@ class LanceTables:
 
     def __init__(self, uri: str) -> None:
         if "://" not in uri and not os.path.isdir(uri):
-            raise OgPointcloudError(f"'{uri}' is no folder; expected what og-pointcloud index --lance wrote")
+            raise OgPointcloudError(f"'{uri}' is not a folder; expected one that og-pointcloud index --lance wrote")
         self._uri, self._database = uri, _database(uri)
 
     def require(self, atlas: Atlas) -> None:
         """OgPointcloudError unless these hold all scenes of an atlas as they are now: new ones would be missed."""
         if atlas.noted(_name(self._uri)) != atlas.fingerprint:
             raise OgPointcloudError(
-                f"'{self._uri}' was not written from {atlas.path} as it is now: write it again with "
+                f"'{self._uri}' was not written from the current {atlas.path}: write it again with "
                 "og-pointcloud index --lance"
             )
 

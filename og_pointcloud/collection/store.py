@@ -145,7 +145,7 @@ class Atlas:
         # have their own.
         query = "SELECT sql FROM sqlite_master WHERE sql <> '' AND NOT (type = 'table' AND name GLOB 'boxes_*')"
         if others := {row[0] for row in self._run(query)} ^ set(SCHEMA):
-            raise _refused(self.path, f"its schema has, or lacks, {min(map(str, others)):.80}")
+            raise _refused(self.path, f"its schema differs in {min(map(str, others)):.80}")
 
     # Reading: records are checked when they are constructed; what they refuse should not have been in the file -----
 
@@ -204,7 +204,7 @@ class Atlas:
         vectors = self.words(digest).vectors
         with self._refusing_damage(f"the bank {digest!r:.40}"):
             if vectors.shape[1] != width:
-                raise ValueError(f"its words have width {vectors.shape[1]}, what they judge {width}")
+                raise ValueError(f"its words have dimension {vectors.shape[1]}, the descriptors {width}")
             return WordBank(vectors)
 
     def within(self, low: ArrayLike, high: ArrayLike) -> set[int]:
@@ -287,7 +287,7 @@ def _floats(blob: bytes, *shape: int) -> NDArray[np.float32]:
 
 def _finite(values: Any) -> Any:
     if not np.isfinite(values).all():
-        raise ValueError("it holds NaN or infinity")
+        raise ValueError("it contains NaN or infinity")
     return values
 
 
@@ -296,12 +296,12 @@ def _explained(path: Path, reason: str) -> OgPointcloudError:
     if "locked" in reason:
         return OgPointcloudError(f"{path} is being changed by another process; wait for it, then try again")
     if "unable to open" in reason:
-        return OgPointcloudError(f"{path} cannot be opened ({reason}); expected a file in a folder of yours")
+        return OgPointcloudError(f"{path} cannot be opened ({reason}); expected a file in a folder that you may use")
     if "full" in reason or "readonly" in reason or "I/O" in reason:
-        return OgPointcloudError(f"{path} cannot be written ({reason}): it stays as it was; make room for it")
+        return OgPointcloudError(f"{path} cannot be written ({reason}): it is unchanged; free some space")
     return _refused(path, reason)
 
 
 def _refused(path: Path, reason: str) -> OgPointcloudError:
-    again = "give an atlas, or a new name, to og-pointcloud index"
-    return OgPointcloudError(f"{path} is no atlas that can be used ({reason:.120}): {again}")
+    again = "give og-pointcloud index an atlas, or a new name"
+    return OgPointcloudError(f"{path} is not a usable atlas ({reason:.120}): {again}")

@@ -52,8 +52,8 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
     cloud = scene.cloud
     if len(cloud) != len(truth.cls):
         raise SceneError(
-            f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected the points of the truth, in "
-            "its order: fit the capture's own cloud, without --gaussians, or write gt.npz for the points of this file"
+            f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected the truth's points in the "
+            "same order: fit the capture's own cloud, without --gaussians, or write gt.npz for this file's points"
         )
     result = segment(scene, None, text_features=text_features)
     return Answer(truth.class_of(result.labels, result.names), result.instances, cloud.xyz, cloud.spacing)
@@ -63,7 +63,7 @@ def score_capture(answer: Answer, truth: Truth) -> CaptureScore:
     """All scores of one answer. SceneError where no class of the truth has enough points to be scored."""
     labels = truth.score(answer.called)
     if not labels.classes:
-        raise SceneError("no class of the truth has 30 points that can be scored; expected one or more")
+        raise SceneError("no class of the truth has 30 points that can be scored; expected at least one")
     counted = truth.scored & np.isin(truth.cls, labels.classes)
     answered = answer.called >= 0
     return CaptureScore(

@@ -57,7 +57,7 @@ def bootstrap(scores: NDArray[np.floating]) -> Interval:
     values = np.asarray(scores, np.float64)
     values = values[np.isfinite(values)]
     if values.ndim != 1 or len(values) == 0:
-        raise OgPointcloudError("no finite score to draw from; expected one or more")
+        raise OgPointcloudError("no finite score to draw from; expected at least one")
     means = [values[drawn].mean(axis=1) for drawn in _draws(len(values), DRAWS)]
     low, high = np.percentile(np.concatenate(means), (2.5, 97.5))
     return Interval(float(values.mean()), float(low), float(high))
@@ -74,7 +74,7 @@ def miou_interval(
     same unit. classes: those that the score averages; OgPointcloudError if there are none.
     """
     if not classes:
-        raise OgPointcloudError("no class has points enough to be scored, so their mean has no interval; expected one")
+        raise OgPointcloudError("no class has enough points to be scored, so the mean has no interval; expected one")
     evaluated = truth.scored & np.isin(truth.cls, classes)
     counted = evaluated if truth.background is None else evaluated | truth.background
     points, true = np.asarray(xyz, np.float64)[counted], np.where(evaluated, truth.cls, -1)[counted]

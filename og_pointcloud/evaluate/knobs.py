@@ -69,6 +69,6 @@ def settings_of(knobs: tuple[str, ...] | None = None) -> list[Setting]:
     names = tuple(KNOBS) if knobs is None else knobs
     unknown = [name for name in names if name not in KNOBS]
     if unknown:
-        raise OgPointcloudError(f"'{unknown[0]}' is no knob; expected one of {', '.join(KNOBS)}")
+        raise OgPointcloudError(f"'{unknown[0]}' is not a knob; expected one of {', '.join(KNOBS)}")
     values = (value for name in dict.fromkeys(names) for value in KNOBS[name])
     return [DEFAULT, *(one for one in values if (one.settings, one.every) != (DEFAULT.settings, DEFAULT.every))]

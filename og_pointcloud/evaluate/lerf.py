@@ -92,8 +92,8 @@ def scene_names(folder: Path) -> list[str]:
     names = sorted({file.parent.name for file in (folder / LABEL_FOLDER).glob("*/*.json")})
     if not names:
         raise SceneError(
-            f"{folder} has no {LABEL_FOLDER}/<scene>/frame_*.json; expected the folder of LeRF-OVS, with <scene>/ and "
-            f"{LABEL_FOLDER}/ in it"
+            f"{folder} has no {LABEL_FOLDER}/<scene>/frame_*.json; expected the LeRF-OVS folder, which contains "
+            f"<scene>/ and {LABEL_FOLDER}/"
         )
     return names
 
@@ -112,12 +112,12 @@ def read_scene(folder: Path, name: str) -> LerfScene:
         frame = read_frame(file)
         image = images.get(frame.name)
         if image is None:
-            raise SceneError(f"{file} is of frame '{frame.name}', of which {model} has no pose; it has {len(images)}")
+            raise SceneError(f"{file}: frame '{frame.name}' has none of the {len(images)} poses in {model}")
         if image.lens is not None:
-            raise SceneError(f"{model}: frame '{frame.name}' has a distorted lens; labels are of undistorted images")
+            raise SceneError(f"{model}: frame '{frame.name}' has a distorted lens; labels are for undistorted images")
         size, labelled = (image.camera.width, image.camera.height), (frame.width, frame.height)
         if not same_shape(size, labelled):
-            raise SceneError(f"{file} is of {labelled} pixels, its camera of {size}; expected one shape, scaled")
+            raise SceneError(f"{file} has {labelled} pixels, its camera {size}; expected the same aspect ratio")
         frames.append(frame)
         cameras.append(image.camera.resized(*labelled))
     return LerfScene(name, tuple(frames), tuple(cameras))
@@ -132,10 +132,10 @@ def read_frame(file: str | Path) -> LabelledFrame:
         outlines = [(str(entry["category"]), entry["segmentation"]) for entry in objects]
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise SceneError(
-            f"{file} is no label file of LeRF-OVS, with info and objects ({error}): copy it anew"
+            f"{file} is not a LeRF-OVS label file with info and objects ({error}): copy it again"
         ) from None
     if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise SceneError(f"{file} is of an image of {width}x{height} pixels; expected 1 to {MAX_PIXELS}")
+        raise SceneError(f"{file} is for an image of {width}x{height} pixels; expected 1 to {MAX_PIXELS}")
     masks: dict[str, NDArray[np.bool_]] = {}
     for category, outline in outlines:
         # Outlines of one category are one object: their union.
@@ -163,10 +163,10 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
     points = read_points(file)
     gaussians = Gaussians.from_points(points)
     if len(points) != len(cloud):
-        raise SceneError(f"{file} has {len(points)} Gaussians, the scene {len(cloud)} points; expected one each")
+        raise SceneError(f"{file} has {len(points)} Gaussians, the scene {len(cloud)} points; expected one per point")
     apart = float(np.abs(points.xyz_world - cloud.xyz_world).max(initial=0))
     if apart > MAX_OFFSET_SPACINGS * cloud.spacing:
-        raise SceneError(f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected those it is of")
+        raise SceneError(f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected its own")
     return Gaussians(cloud.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity)
 
 
@@ -212,7 +212,7 @@ def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float
     """
     scenes = [np.asarray(values, np.float64) for values in ious.values() if len(values)]
     if not scenes:
-        raise SceneError("no labelled object in any frame; expected at least one")
+        raise SceneError("no labeled object in any frame; expected at least one")
     return float(np.mean([scene.mean() for scene in scenes])), float(np.mean([(s > MIN_IOU).mean() for s in scenes]))
 
 

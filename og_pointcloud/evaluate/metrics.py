@@ -48,7 +48,7 @@ def score_labels(
     others = {"truth": truth, "background": background, "scored": scored}
     for name, values in others.items():
         if values is not None and values.shape != labels.shape:
-            raise OgPointcloudError(f"{name} has shape {values.shape}, the labels {labels.shape}; expected one a point")
+            raise OgPointcloudError(f"{name} is {values.shape}, the labels are {labels.shape}; expected one per point")
     evaluated = truth >= 0 if scored is None else (truth >= 0) & scored
     ids, counts = np.unique(truth[evaluated], return_counts=True)
     classes = ids[counts >= min_points]
@@ -81,7 +81,7 @@ def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer])
     """
     first, second = np.asarray(first), np.asarray(second)
     if first.shape != second.shape:
-        raise OgPointcloudError(f"partitions have shapes {first.shape} and {second.shape}; expected an id a point")
+        raise OgPointcloudError(f"partitions have shapes {first.shape} and {second.shape}; expected an id per point")
     _, rows = np.unique(first, return_inverse=True)
     _, columns = np.unique(second, return_inverse=True)
     if len(rows) == 0:

@@ -123,8 +123,8 @@ def read_subject(folder: Path) -> Subject:
     (vocabulary, space), truth = read_text_features(words), read_truth(folder)
     if len(truth.cls) != len(scene.points):
         raise SceneError(
-            f"{folder.name}: the truth is of {len(truth.cls)} points, the cloud has {len(scene.points)}; expected one "
-            "each"
+            f"{folder.name}: the truth has {len(truth.cls)} points, the cloud {len(scene.points)}; expected the same "
+            "number"
         )
     masks, names = (scene.feature_space, scene.feature_width), (space, vocabulary.vectors.shape[1])
     FeatureSpace(*masks).require(FeatureSpace(*names), f"names of {words}")
@@ -170,7 +170,7 @@ class _Trial:
         self.subject = subject
         if needs_tiles(subject.scene, DEFAULT.settings):
             raise OgPointcloudError(
-                f"{subject.name}: {len(subject.scene.points):,} points take more memory than there is for all settings;"
+                f"{subject.name}: {len(subject.scene.points):,} points need more memory than there is for all settings;"
                 " expected fewer: report on a part of the cloud"
             )
         self.warm: set[str] = set()

@@ -66,7 +66,7 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
         set_formatter(LogFormatter())  # 20, not 2 x 10^1
     axes.set_yscale("symlog", linthresh=LINEAR_BELOW)
     axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
-    axes.set(xlabel="seconds of the whole fit (log)", ylabel=f"error, {error_name(rows)}")
+    axes.set(xlabel="seconds for the whole fit (log)", ylabel=f"error, {error_name(rows)}")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7.5, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
 
@@ -80,8 +80,8 @@ def write_report(sweep: Sweep, path: Path, chart: Path) -> Path:
     """The tables as Markdown, with the chart that lies beside it; written whole or not at all."""
     parts = [
         "# Error against run time",
-        f"Measured on {machine()}. Seconds are of a whole fit; compare them within one report; less than a tenth of "
-        "them is noise. A gain whose interval holds 0 may be chance.",
+        f"Measured on {machine()}. Seconds are for a whole fit: compare them within one report; differences "
+        "below a tenth are noise. A gain whose interval contains 0 may be chance.",
         f"![error against seconds]({chart.name})",
         *_list("Could not be run", (f"{what}: {why}" for what, why in sweep.failed.items())),
     ]

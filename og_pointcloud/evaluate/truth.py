@@ -48,7 +48,7 @@ class Truth:
     def score(self, called: NDArray[np.integer]) -> Score:
         """The score of the classes (n,) given to points, as `class_of` returns them; SceneError for another length."""
         if len(called) != len(self.cls):
-            raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(called)}; expected one each")
+            raise SceneError(f"{len(called)} labels for {len(self.cls)} points of {GT_NAME}; expected one per point")
         return score_labels(called, self.cls, scored=self.scored, background=self.background)
 
 
@@ -62,8 +62,8 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
     path = Path(folder) / GT_NAME
     if not path.is_file():
         raise SceneError(
-            f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
-            "take a made room: og-pointcloud demo"
+            f"{path} is not a file; a score needs it: 'cls' (n,), a class per point, -1 for none, and 'names'. "
+            "Without one, use the demo room: og-pointcloud demo"
         )
     entries = read_npz(path, ("cls", "names"), POINT_ARRAYS, MAX_UNPACKED_BYTES, "'cls' (n,) and 'names' (L,)")
     cls, names = entries["cls"], entries["names"]
@@ -74,7 +74,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
         )
     for name in POINT_ARRAYS:
         if name in entries and entries[name].shape != cls.shape:
-            raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one a point")
+            raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one per point")
     instance = entries.get("instance")
     if instance is not None and instance.dtype.kind not in "iu":
         raise SceneError(f"{path}: instance is {instance.dtype}; expected whole numbers, below 0 for none")

@@ -75,7 +75,7 @@ def fit(
     array([800, 800], dtype=int32)
     """
     if not isinstance(scene, Scene):
-        raise SceneError(f"scene is a {type(scene).__name__}; expected a Scene, as og.read_capture(FOLDER) makes one")
+        raise SceneError(f"scene is a {type(scene).__name__}; expected a Scene, as og.read_capture(FOLDER) returns")
     settings = fit_settings(settings)
     journal = Journal(progress)
     with journal.stage("checks"):
@@ -171,7 +171,7 @@ def _check(scene: Scene, journal: Journal) -> None:
     if masks == 0:
         raise SceneError(f"none of the {len(scene.views)} views has a mask; expected at least one: make masks first")
     if len(scene.views) == 1:
-        journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
+        journal.warnings.append("only one view: nothing can contradict its masks, so every mask is an instance")
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
@@ -253,7 +253,7 @@ def _cloud_of(
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
     journal.notes["instances"] = len(labelling.instances)
     if len(labelling.instances) == 0:
-        journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no point")
+        journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no points")
     return LabelledCloud(
         xyz=scene.points.xyz,
         origin=scene.points.origin,

@@ -238,13 +238,13 @@ def require_sight(exposed: int, masked: int, scene: Scene) -> None:
     places = f"the cloud spans {span(scene.points.xyz_world)}, the cameras stand at {span(cameras)}"
     if exposed == 0:
         raise SceneError(
-            f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
-            "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented; "
-            f"{places}"
+            f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, no point in any image; "
+            "check that poses and cloud are in the same frame and that poses are camera-to-world (transforms.json) as "
+            f"documented; {places}"
         )
     raise SceneError(
         f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least "
-        f"one: make masks, and check that poses and cloud share one frame; {places}"
+        f"one: make masks, and check that poses and cloud are in the same frame; {places}"
     )
 
 
@@ -280,7 +280,7 @@ class SparseRows:
         if entries > np.iinfo(np.int32).max:
             raise OgPointcloudError(
                 f"the mask table has {entries:,} entries; expected fewer than 2^31: use fewer views, larger pixels, or "
-                "parts of the cloud"
+                "part of the cloud"
             )
         self.width, self.filled = width, 0
         make = scratch_array if on_disk else np.empty

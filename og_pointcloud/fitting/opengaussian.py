@@ -84,8 +84,8 @@ def read_opengaussian(
     kept = points.opacity >= min_opacity
     if not kept.any():
         raise SceneError(
-            f"{ply}: none of {len(points)} Gaussians has an opacity of {min_opacity} or more (the largest is "
-            f"{points.opacity.max(initial=0):.3g}); expected visible ones: lower min_opacity"
+            f"{ply}: none of the {len(points)} Gaussians has an opacity of {min_opacity} or more (the largest is "
+            f"{points.opacity.max(initial=0):.3g}); expected at least one: lower min_opacity"
         )
     xyz = points.xyz[kept]
     # Leaves with a Gaussian that is kept become instances 0, 1, ...; k1 k2 leaves are mostly empty.
@@ -112,32 +112,32 @@ def _find_result(result: Path, cluster_lang: Path | None) -> tuple[Path, Path]:
     else:
         ply, folders = result, []
     if not ply.is_file():
-        raise SceneError(f"{ply} is not a file; expected a result folder of OpenGaussian or its point_cloud.ply")
+        raise SceneError(f"{ply} is not a file; expected an OpenGaussian result folder or its point_cloud.ply")
     # The .ply lies in point_cloud/iteration_N/ of the folder that holds the .npz.
     folders += [ply.parent, *ply.resolve().parents[2:3]]
     choices = [folder / "cluster_lang.npz" for folder in folders] if cluster_lang is None else [cluster_lang]
     clusters = next((file for file in choices if file.is_file()), None)
     if clusters is None:
         raise SceneError(
-            f"{choices[0]} is not a file; expected the leaves' features that OpenGaussian writes after its last stage: "
-            "finish the run, or name the file (--cluster-lang)"
+            f"{choices[0]} is not a file; expected the leaf features that OpenGaussian writes after its last stage: "
+            "finish the run, or give the file (--cluster-lang)"
         )
     return ply, clusters
 
 
 def _read_leaves(file: Path, gaussians: int) -> _Leaves:
     """The four arrays, each of plain numbers in its shape; SceneError for anything else."""
-    arrays = read_npz(file, ARRAYS, (), MAX_UNPACKED_BYTES, f"{', '.join(ARRAYS)}: name the file written last")
+    arrays = read_npz(file, ARRAYS, (), MAX_UNPACKED_BYTES, f"{', '.join(ARRAYS)}: give the file written last")
     features, score, views, of_gaussian = (arrays[name] for name in ARRAYS)
     if features.ndim != 2 or features.dtype.kind != "f":
-        raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, width)")
+        raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, D)")
     # One value a leaf, and one leaf a Gaussian: another number of Gaussians means files of two runs.
     leaves = len(features)
     for name, kinds, length in zip(ARRAYS[1:], ("fiu", "fiu", "iu"), (leaves, leaves, gaussians), strict=True):
         if arrays[name].dtype.kind not in kinds or arrays[name].shape not in ((length,), (length, 1)):
             raise SceneError(
                 f"{name} is {arrays[name].dtype} {arrays[name].shape}; expected "
-                f"{'numbers' if 'f' in kinds else 'integers'} of shape ({length},): give the two files of one run"
+                f"{'numbers' if 'f' in kinds else 'integers'} of shape ({length},): give two files of the same run"
             )
     # In float64 no bound rounds; NaN is within none.
     largest = np.finfo(np.float32).max
@@ -147,8 +147,8 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
         if not within.all():
             row = int(np.argwhere(~within)[0][0])
             raise SceneError(
-                f"{name} row {row} holds {arrays[name][row]!s:.60}; expected numbers from {least:g} to {most:g}: give "
-                "the two files of one run, or associate again"
+                f"{name} row {row} is {arrays[name][row]!s:.60}; expected numbers from {least:g} to {most:g}: give two "
+                "files of the same run, or run the association again"
             )
     unit = directions(features)
     return _Leaves(
@@ -186,7 +186,7 @@ def _provenance(
         left_out.append(left_out_entry(LeftOut.EMPTY_LEAVES, count=total - count, total=total))
     if faint:
         left_out.append(left_out_entry(LeftOut.FAINT_GAUSSIANS, count=faint, opacity=min_opacity))
-    warnings = [f"{undescribed} of {count} instances have no feature and answer unknown"] if undescribed else []
+    warnings = [f"{undescribed} of {count} instances have no feature and are always unknown"] if undescribed else []
     return {
         "source": "OpenGaussian result",
         "files": {"gaussians": f"{ply.parent.name}/{ply.name}", "clusters": clusters.name},

@@ -207,11 +207,11 @@ def likely_cause(found: Reliability) -> str:
     """In words, why a reliability is low. Wrong poses are found by the checks of the capture (checking/)."""
     # A half cannot label what it does not see: ``again`` is then low whatever the masks.
     if found.alone > 0.25:
-        return f"too few views: {found.alone:.0%} of the labelled points are seen by one half of the views alone"
+        return f"too few views: {found.alone:.0%} of the labeled points are seen by only one half of the views"
     again, named = float(np.nanmean(found.again)), float(np.nanmean(found.named))
     if named < again:
-        return f"masks of one thing are named differently: {named:.0%} of them, read alone, name their instance"
+        return f"masks of the same object are named differently: {named:.0%} of them, taken alone, name their instance"
     return (
-        f"half of the views give {again:.0%} of the points the same label: masks disagree about what is one thing, or "
-        "do not lie where the poses say"
+        f"half of the views give {again:.0%} of the points the same label: masks disagree about what is one object, "
+        "or are not where the poses say"
     )

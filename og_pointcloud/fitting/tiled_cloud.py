@@ -146,8 +146,8 @@ def _opened(folder: Path, key: str) -> TiledCloud:
 def vanished() -> NoReturn:
     """Called to make arrays that another process should have made already: raises."""
     raise OgPointcloudError(
-        "a file of the work folder is gone or damaged, or a worker cannot see it; expected one folder that all workers "
-        "share: name such a work folder, or set TMPDIR to one"
+        "a file of the work folder is missing or damaged, or a worker cannot see it; expected a folder "
+        "that all workers share: give such a work folder, or set TMPDIR to one"
     )
 
 

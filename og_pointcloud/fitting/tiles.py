@@ -122,7 +122,7 @@ def fit_tiles(
     if LABELLERS[settings.mode] is not grouping:
         raise OgPointcloudError(
             f'mode is "{settings.mode}", which learns from all points at once; expected "grouping" for a fit in tiles: '
-            "take that, or thin the cloud until it fits whole"
+            "use that, or thin the cloud until it fits into memory"
         )
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
@@ -170,8 +170,8 @@ def _points_per_tile(points: int, left: int) -> int:
     if fitting < MIN_TILE_POINTS:
         raise OgPointcloudError(
             f"{points:,} points take {points * POINT_CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of "
-            f"{MIN_TILE_POINTS:,} {MIN_TILE_POINTS * POINT_TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: "
-            "give it more memory, or thin the cloud"
+            f"{MIN_TILE_POINTS:,} points take {MIN_TILE_POINTS * POINT_TILE_BYTES / 1e9:.1f} GB; the fit has "
+            f"{left / 1e9:.1f} GB: give it more memory, or thin the cloud"
         )
     return min(MIN_TILE_POINTS << (fitting // MIN_TILE_POINTS).bit_length() - 1, MAX_TILE_POINTS)
 

@@ -201,7 +201,7 @@ class WorkFolder:
             size = sum(array.nbytes for array in arrays) / 1e6
             raise OgPointcloudError(
                 f"'{path}' cannot be written ({error.strerror}); expected room for {size:.1f} MB: give a work folder "
-                "on a larger disk, or, for a run without one, set TMPDIR to such a disk"
+                "on a larger disk, or, without a work folder, set TMPDIR to such a disk"
             ) from error
         self._verified.add(label)
 

@@ -138,9 +138,9 @@ def compare_visits(
     known; then all points of the later visit count as seen.
     """
     a, b = earlier.cloud, later.cloud
-    a.space.require(b.space, "later descriptors")
+    a.space.require(b.space, "descriptors of the later visit")
     if not b.cameras and later.depth is None:
-        raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
+        raise SceneError("the later visit has no cameras, so what it looked at is unknown: fit its capture again")
     scatter, spacing = max(earlier.surface.scatter, later.surface.scatter), max(a.spacing, b.spacing)
     tolerance = tolerance_of(spacing, scatter)
     # What the earlier views say about both visits' points.
@@ -174,12 +174,12 @@ def _require_one_frame(now: Presence) -> None:
     if through > MAX_THROUGH_SHARE * (still + through) or still < MIN_STILL_SHARE * met:
         raise SceneError(
             f"of {met:,} points that the later visit looks at, {still:,} are where they were and {through:,} are seen "
-            "through; expected few changes: the two do not lie in one world frame, or are of two places: register "
-            "their poses first"
+            "through; expected few changes: the two are not in the same world frame, or show different places: "
+            "register their poses first"
         )
     if not met:
-        what = f"the later visit looks at none of the earlier one's {len(now.balance):,} points: the two do not overlap"
-        warnings.warn(f"{what}, or do not lie in one world frame, so nothing is known of changes", stacklevel=4)
+        what = f"the later visit looks at none of the earlier visit's {len(now.balance):,} points: they do not overlap"
+        warnings.warn(f"{what}, or are not in the same world frame, so changes are unknown", stacklevel=4)
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
         raise SceneError(f"{name}: its camera is a {type(frame.camera).__name__}; expected an og.Camera")
     camera = in_local_frame(frame.camera, origin)
     if frame.depth is not None and frame.cloud is not None:
-        raise SceneError(f"{name} has both depth and a cloud; expected one of them: leave out the sparser one")
+        raise SceneError(f"{name} has both depth and a cloud; expected only one: leave out the sparser one")
     ids, features = _masks(frame, camera, name)
     if len(features):
         encoder = space.name if frame.feature_space is None else frame.feature_space
@@ -116,7 +116,7 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
     features = np.zeros((0, 0), np.float32) if frame.features is None else numbers_of(frame.features)
     if features.dtype.kind not in "fiu" or features.ndim != 2:
         raise FeatureSpaceError(
-            f"{name}: mask features are {features.dtype} {features.shape}; expected numbers (masks, width)"
+            f"{name}: mask features are {features.dtype} {features.shape}; expected numbers of shape (masks, D)"
         )
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, which View refuses
         features = features.astype(np.float32)
@@ -126,8 +126,8 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
         ids = numbers_of(frame.masks)
         if ids.dtype.kind not in "iu" or ids.ndim != 2:
             raise SceneError(
-                f"{name}: masks are {ids.dtype} {ids.shape}; expected whole numbers ({camera.height}, {camera.width}): "
-                "rows of features, -1 outside of masks"
+                f"{name}: masks are {ids.dtype} {ids.shape}; expected whole numbers of shape ({camera.height}, "
+                f"{camera.width}): rows of features, -1 outside of masks"
             )
     view = View(name, camera, ids, features)  # checks sizes, ids and finite rows
     return np.maximum(view.mask_map(), -1), features
@@ -138,7 +138,7 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
     depth = np.zeros((camera.height, camera.width), np.float32) if frame.depth is None else numbers_of(frame.depth)
     if depth.shape != (camera.height, camera.width) or depth.dtype.kind not in "fiu":
         raise SceneError(
-            f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers ({camera.height}, {camera.width})"
+            f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers of shape ({camera.height}, {camera.width})"
         )
     if frame.cloud is not None:
         with naming(name):
@@ -177,10 +177,10 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
         what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
     else:
         what = (
-            "its pose is off, it is of another place, or something stands before the camera: check these, or correct "
+            "its pose is off, it shows another place, or something blocks the camera: check these, or correct "
             "the map after a loop closure"
         )
     raise SceneError(
-        f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; expected "
+        f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} map points in front of it; expected "
         f"at least {MIN_AGREEING_SHARE:.0%}: {what}"
     )

@@ -71,5 +71,5 @@ class FrameQueue:
             if change is None and isinstance(error, OgPointcloudError):
                 self._on_drop(f"a frame was refused: {error}")
             else:
-                what = "a frame failed" if change is None else "a frame went in, but on_change failed"
+                what = "a frame failed" if change is None else "a frame was added, but on_change failed"
                 self._on_drop(f"{what}: {type(error).__name__}: {error}")

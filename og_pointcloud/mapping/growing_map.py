@@ -153,7 +153,7 @@ class GrowingMap:
         """Stamp -> a camera with the corrected world_to_camera of that frame. SceneError or a warning as in
         `Mapper.correct`."""
         if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
-            raise SceneError(f"a pose is of frame {strange[0]!r}; expected the frame's stamp, a number")
+            raise SceneError(f"a pose is given for frame {strange[0]!r}; expected the frame's stamp, a number")
         cameras = {float(t): Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose)) for t, pose in poses.items()}
         self._warn_of_strange(cameras.keys())
         return cameras
@@ -190,9 +190,9 @@ class GrowingMap:
         some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
         if strange and len(strange) == len(stamps):
             there = f", {min(known):.15g} to {max(known):.15g}" if known else ""
-            raise SceneError(f"the poses' stamps are {some}; expected those of frames that were integrated{there}")
+            raise SceneError(f"the poses have stamps {some}; expected those of integrated frames{there}")
         if strange:
-            what = f"{len(strange)} of {len(stamps)} poses are of no frame that was integrated: {some}"
+            what = f"{len(strange)} of {len(stamps)} poses are for frames that were not integrated: {some}"
             warnings.warn(what, stacklevel=4)
 
     def count(self, stamp: float) -> None:

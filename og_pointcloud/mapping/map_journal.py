@@ -96,12 +96,12 @@ class MapJournal:
             record = _next_record(file)
         content = None if record is None else unpacked(record, str(self._state))
         if not (isinstance(content, tuple) and len(content) == 2 and isinstance(content[1], GrowingMap)):
-            raise OgPointcloudError(f"{self._state} is damaged, or another version's: remove the folder and map again")
+            raise OgPointcloudError(f"{self._state} is damaged or of another version: remove the folder and map again")
         began_with, map_ = content
         if began_with != self._origin:
             raise OgPointcloudError(
-                f"{self.folder} holds a map that began with {began_with}, not with {self._origin}: give that, or "
-                "another folder"
+                f"{self.folder} has a map that began with {began_with}, not with {self._origin}: begin with that, or "
+                "give another folder"
             )
         return map_
 
@@ -115,7 +115,7 @@ class MapJournal:
             # The file is about to be truncated and written: refuse a link, or a file of something else.
             if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
                 raise OgPointcloudError(
-                    f"{self._log} was not written by a map of this version: it is left as it is; give another folder"
+                    f"{self._log} was not written by this version and is left as it is: give another folder"
                 )
             while record := _next_record(file):
                 intact = file.tell()
@@ -133,7 +133,7 @@ class MapJournal:
             if change.masks is not None and change.masks.max(initial=0) < 1 << 15:
                 change = replace(change, masks=change.masks.astype(np.int16))
         if _OPEN_JOURNALS.get(self.folder.resolve()) is not self:
-            raise OgPointcloudError(f"another mapper has gone on with '{self.folder}': this one cannot write there")
+            raise OgPointcloudError(f"another mapper now writes to '{self.folder}': this one no longer can")
         record = _record((number, change))
         with naming(self.folder):
             self._file = self._file or self._log.open("ab", buffering=0)
@@ -154,7 +154,7 @@ class MapJournal:
             with replacing(self._state) as file:
                 file.write(_record((self._origin, map_)))
         except OSError as error:
-            what = f"{self._state} cannot be written ({error.strerror}): its log of changes grows on"
+            what = f"{self._state} cannot be written ({error.strerror}): its log of changes keeps growing"
             warnings.warn(what, stacklevel=4)
             return
         with naming(self.folder):

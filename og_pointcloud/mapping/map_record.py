@@ -61,11 +61,11 @@ class MapRecord:
                 f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
             ) from None
         if not record.visits:
-            raise OgPointcloudError("the map's record has no visit; expected one or more: fit it again")
+            raise OgPointcloudError("the map's record has no visits; expected at least one: fit it again")
         # Ids are rows of the table: one beyond it would be noticed only when it is used.
         ids = {*record.last_seen, *record.moved_from, *record.gone}
         if ids and not 0 <= min(ids) <= max(ids) < count:
-            raise OgPointcloudError(f"the map's record names instance {max(ids)} of {count}: fit it again")
+            raise OgPointcloudError(f"the map's record names instance {max(ids)}, the map has {count}: fit it again")
         return record
 
     def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:

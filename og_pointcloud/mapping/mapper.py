@@ -97,7 +97,7 @@ class Mapper:
         journal: str | os.PathLike[str] | None = None,
     ) -> None:
         if start is not None and cloud is not None:
-            raise SceneError("both a map and a cloud are given; expected one of them: the map has points of its own")
+            raise SceneError("both a map and a cloud are given; expected only one: the map has its own points")
         if spacing is not None and not (isinstance(spacing, Real) and spacing is not True and 0 < spacing < np.inf):
             raise SceneError(f"spacing is {spacing!r}; expected a positive length, or None")
         self.settings = fit_settings(settings)
@@ -118,7 +118,7 @@ class Mapper:
     def _start_from(self, points: Points, space: FeatureSpace, spacing: float | None, *, grows: bool) -> GrowingMap:
         """Start with known points. spacing None: their own."""
         if not len(points):
-            raise SceneError("the map has 0 points; expected at least one: begin an empty one, without start and cloud")
+            raise SceneError("the map has 0 points; expected at least one: leave out start and cloud to begin empty")
         require_finite(points.xyz)
         self._neighborhood = neighborhood(points.xyz, self.settings.geometry)
         spacing = float(np.median(self._neighborhood.spacing)) if spacing is None else spacing
@@ -175,7 +175,7 @@ class Mapper:
             except OgPointcloudError:
                 raise
             except Exception as error:  # it failed the first time, too, and a map in a queue went on then
-                warnings.warn(f"change {number} of the journal fails ({type(error).__name__}: {error})", stacklevel=4)
+                warnings.warn(f"change {number} in the journal failed ({type(error).__name__}: {error})", stacklevel=4)
         return journal
 
     def holds(self, stamp: float) -> bool:
@@ -263,7 +263,7 @@ class Mapper:
         if not isinstance(poses, Mapping):
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
         if self._map is None:
-            raise SceneError("no frame was integrated yet, so there is nothing to correct: integrate some first")
+            raise SceneError("no frame has been integrated yet, so there is nothing to correct: integrate some first")
         cameras = self._map.checked_poses(poses)
         if self._journal is not None:
             self._journal.append(self._map.sequence, {stamp: of.world_to_camera for stamp, of in cameras.items()})
@@ -284,7 +284,7 @@ class Mapper:
             if valid.view is None:
                 raise SceneError(
                     f"frame {valid.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
-                    "start with Mapper(cloud=points), or with a map, where frames have masks alone"
+                    "if frames only have masks, start with Mapper(cloud=points) or with a map"
                 )
             # From the original pixels: a sparse image is read with larger ones, but many frames fill the gaps.
             pixel = valid.view.pixel * valid.view.camera.fx / valid.camera.fx
@@ -331,6 +331,6 @@ def _placed(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """The rows (n, 3) that are finite, as `read_points` keeps of a file."""
     placed = np.isfinite(xyz).all(axis=1)
     if not placed.all():
-        what = f"{np.count_nonzero(~placed)} of {len(xyz)} points hold NaN or infinity: the map leaves them out"
+        what = f"{np.count_nonzero(~placed)} of {len(xyz)} points contain NaN or infinity: the map leaves them out"
         warnings.warn(what, stacklevel=3)
     return xyz[placed]

@@ -61,9 +61,7 @@ def update(
     0 gone, 0 new, 0 moved, 0 not seen again
     """
     if not isinstance(capture, Scene):
-        raise SceneError(
-            f"capture is a {type(capture).__name__}; expected a Scene, as og.read_capture(FOLDER) makes one"
-        )
+        raise SceneError(f"capture is a {type(capture).__name__}; expected a Scene, as og.read_capture(FOLDER) returns")
     cloud = as_scene(before).cloud
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
     visit = fit(capture, settings, progress=progress)

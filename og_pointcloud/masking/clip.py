@@ -103,7 +103,7 @@ def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
         raise OgPointcloudError(
-            f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
+            f"{folder}/preprocessor_config.json: resample is {number!r:.20}, rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
     mean, std = CLIP_MEAN_STD if config.model_type == "clip" else SIGLIP_MEAN_STD
@@ -116,7 +116,7 @@ def published_name(folder: StrPath) -> str:
     name = read_config(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
         raise OgPointcloudError(
-            f"{folder} does not say which model it is; pass --feature-space as your scenes name it (og-pointcloud info "
-            "S.ogpc), such as openai/clip-vit-base-patch32 or laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+            f"{folder} does not say which model it is; pass --feature-space with the name in your scenes "
+            "(og-pointcloud info S.ogpc), such as openai/clip-vit-base-patch32 or laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
         )
     return name

@@ -36,10 +36,10 @@ class Proposals:
             raise SceneError(f"proposals are {self.masks.dtype} {self.masks.shape}; expected bool (masks, H, W)")
         if self.scores.shape != (len(self.masks),) or not np.isfinite(self.scores).all():
             raise SceneError(
-                f"{len(self.masks)} proposals have scores of shape {self.scores.shape}; expected a finite one each"
+                f"{len(self.masks)} proposals have scores {self.scores.shape}; expected a finite one per proposal"
             )
         if self.tracks is not None and self.tracks.shape != self.scores.shape:
-            raise SceneError(f"{len(self.masks)} proposals have tracks of shape {self.tracks.shape}; expected one each")
+            raise SceneError(f"{len(self.masks)} proposals have tracks {self.tracks.shape}; expected one per proposal")
 
     def __len__(self) -> int:
         return len(self.masks)
@@ -116,11 +116,11 @@ class MaskSettings:
         if self.features not in FEATURES:
             raise OgPointcloudError(f"features are '{self.features}'; expected one of {', '.join(FEATURES)}")
         if self.features != "crops" and self.encoder is None:
-            raise OgPointcloudError(f"features are '{self.features}' without an encoder; expected one, or crops")
+            raise OgPointcloudError(f"features are '{self.features}' without an encoder; expected an encoder, or crops")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
         if isinstance(self.words, str):  # would become one word per letter
-            raise OgPointcloudError(f"words are {self.words!r:.60}; expected a tuple of them, as ({self.words!r:.60},)")
+            raise OgPointcloudError(f"words are {self.words!r:.60}; expected a tuple such as ({self.words!r:.60},)")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
                 f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"

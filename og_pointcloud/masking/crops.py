@@ -38,7 +38,7 @@ class Crop:
 
     def __post_init__(self) -> None:
         if not (1 <= self.scale <= 8 and 0 <= self.outside <= 1 and 0 < self.weight < np.inf):
-            raise SceneError(f"{self} cannot be cut; expected scale 1 to 8, outside 0 to 1 and a weight above 0")
+            raise SceneError(f"{self} cannot be cut; expected scale 1 to 8, outside 0 to 1, and a weight above 0")
 
 
 LANGSPLAT = (Crop(),)
@@ -64,7 +64,7 @@ class Preprocessing:
         if not (known and are_colors and min(self.std) > 0):
             raise OgPointcloudError(
                 f"preprocessing is {self}; expected a size up to {MAX_SIZE}, three finite means, three deviations "
-                "above 0, and bilinear or bicubic"
+                "above 0, and bilinear or bicubic resampling"
             )
 
     @classmethod
@@ -119,11 +119,11 @@ def require_masks(image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> None:
         raise SceneError(f"the image is {image.dtype} {image.shape}; expected uint8 (H, W, 3), red first")
     if masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
         raise SceneError(
-            f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
-            "large as the image"
+            f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), the "
+            "size of the image"
         )
     if not masks.any(axis=(1, 2)).all():
-        raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
+        raise SceneError("a mask has no pixels; expected at least one: leave out empty masks")
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -65,8 +65,8 @@ def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
         return CropEncoder(model, model.crops)
     if model.patch is None:
         raise OgPointcloudError(
-            f"the encoder '{name}' has vectors of whole squares alone; expected for --features dense CLIP or SigLIP, a "
-            "transformers folder or what og-pointcloud export image makes of it today: name one, or take crops"
+            f"the encoder '{name}' only has vectors of whole crops; expected, for --features dense, CLIP or SigLIP "
+            "from transformers or newly exported (og-pointcloud export image): give one, or use --features crops"
         )
     return DenseEncoder(model)
 
@@ -84,9 +84,9 @@ def _open_model(name: StrPath) -> ImageModel:
         return _transformers_model(fetched, str(name))
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
-        f"no encoder '{name}': it is no folder, none of that feature space is in {MODELS_VARIABLE} "
-        f"({named or 'not set'}) or the cache, and it has not been fetched; expected 'demo', a model's folder or "
-        f"OWNER/MODEL: fetch it first (hf download {name}), or name its folder"
+        f"no encoder '{name}': it is not a folder, no encoder of that feature space is in {MODELS_VARIABLE} "
+        f"({named or 'not set'}) or the cache, and it has not been fetched; expected 'demo', a model folder, or "
+        f"OWNER/MODEL: fetch it first (hf download {name}), or give its folder"
     )
 
 
@@ -138,9 +138,9 @@ class OnnxModel:
     def _take(self, manifest: dict[str, Any]) -> None:
         width, space, crops = manifest["width"], manifest["feature_space"], manifest["crops"]
         if type(width) is not int or not 1 <= width < 1 << 24 or not isinstance(space, str):
-            raise ValueError(f"width {width!r:.40} or feature_space {space!r:.60}; expected a whole number and a name")
+            raise ValueError(f"width is {width!r:.40}, feature_space {space!r:.60}; expected a whole number and a name")
         if not isinstance(crops, list) or not crops:
-            raise ValueError(f"crops are {crops!r:.60}; expected a list of at least one")
+            raise ValueError(f"crops are {crops!r:.60}; expected a list of at least one crop")
         self.feature_space: str = space
         self.width: int = width
         self.preprocessing = Preprocessing.from_manifest(manifest["preprocessing"])

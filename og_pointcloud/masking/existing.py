@@ -42,7 +42,7 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     """
     masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
     if masks.shape[-2:] != shape:
-        raise SceneError(f"masks are {masks.shape}, their image {shape}; expected the same (H, W)")
+        raise SceneError(f"masks are {masks.shape}, their image is {shape}; expected the same (H, W)")
     if isinstance(given, Proposals):
         return given
     if masks.ndim == 2 and masks.dtype.kind in "iu":
@@ -50,8 +50,8 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     if masks.ndim == 3 and masks.dtype == np.bool_:
         return Proposals(masks, np.ones(len(masks), np.float32))
     raise SceneError(
-        f"a mask proposer gave {type(given).__name__} {masks.dtype} {masks.shape}; expected Proposals, bool (masks, H, "
-        "W), or an id map of whole numbers (H, W)"
+        f"a mask proposer returned {type(given).__name__} {masks.dtype} {masks.shape}; expected Proposals, bool "
+        "(masks, H, W), or an id map of whole numbers (H, W)"
     )
 
 
@@ -97,7 +97,7 @@ def user_proposer(place: str) -> MaskProposer:
     made = found() if isinstance(found, type) else found
     if callable(function := getattr(made, "propose", made)):
         return CallableProposer(function, f"python:{place}")
-    raise SceneError(f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose")
+    raise SceneError(f"'python:{place}' is a {type(made).__name__}; expected a function or an object with propose()")
 
 
 def user_source(place: str) -> list[Path]:
@@ -148,7 +148,7 @@ class ExistingMasks:
         if named:
             raise SceneError(
                 f"{self.folder} lists {len(named)} images that '{image_name}' could be ({', '.join(named):.120}); "
-                "expected one: give COCO the paths that the pose file has"
+                "expected one: use the paths of the pose file in the COCO file"
             )
         raise SceneError(
             f"{self.folder} has no masks for image '{image_name}'; expected {png.name}, {single.name}, or a COCO .json "
@@ -193,11 +193,11 @@ def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
     if isinstance(counts, (str, bytes)):
         counts = _decompressed(counts, source)
     elif not (isinstance(counts, list) and all(type(run) is int for run in counts)):
-        raise SceneError(f"{source}: counts are {type(counts).__name__}; expected whole numbers or COCO's text")
+        raise SceneError(f"{source}: counts are {type(counts).__name__}; expected whole numbers or COCO's string")
     if any(run < 0 for run in counts) or sum(counts) != height * width:
         raise SceneError(
-            f"{source}: runs add up to {sum(counts)} pixels (least {min(counts, default=0)}), the image has "
-            f"{height * width}; expected runs that fill it: it is damaged or of another image"
+            f"{source}: runs add up to {sum(counts)} pixels (shortest {min(counts, default=0)}), the image has "
+            f"{height * width}; expected runs that fill it: the file is damaged or for another image"
         )
     values = np.arange(len(counts)) % 2 == 1
     return np.repeat(values, counts).reshape(width, height).T  # runs go down the columns
@@ -222,7 +222,7 @@ def _decompressed(text: str | bytes, source: str) -> list[int]:
     for byte in data:
         bits = byte - 48
         if not 0 <= bits < 64 or shift > 50:
-            raise SceneError(f"{source}: counts hold the byte {byte}; expected COCO's compressed run lengths")
+            raise SceneError(f"{source}: counts contain the byte {byte}; expected COCO's compressed run lengths")
         value |= (bits & 31) << shift
         shift += 5
         if not bits & 32:
@@ -269,7 +269,7 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
         except (ValueError, TypeError):
             corners = np.empty((0, 2))
         if len(corners) < 3 or not (np.abs(corners) < 1e6).all():
-            raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y ... of three corners or more")
+            raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y, ... of at least three corners")
         require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
     return drawn.astype(np.bool_)
 
@@ -288,4 +288,4 @@ def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
 
 def _check_room(masks: int, shape: tuple[int, ...], source: str) -> None:
     if masks * int(np.prod(shape)) > MAX_MASKS_PX:
-        raise SceneError(f"{source} has {masks} masks of {shape}; expected at most {MAX_MASKS_PX} pixels together")
+        raise SceneError(f"{source} has {masks} masks of {shape}; expected at most {MAX_MASKS_PX} pixels in total")

@@ -113,7 +113,7 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
     if names and not separate:
         raise OgPointcloudError(
             f"{len(names)} of {len(photographs)} images would be left out, but the pose file names them all; "
-            "expected a folder for a capture of the others (-o DIR)"
+            "expected a separate folder for a capture of the rest (-o DIR)"
         )
     return names
 
@@ -155,8 +155,8 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
             previewed = True
     if broken:
         raise SceneError(
-            f"{len(broken)} of {len(tasks)} images cannot be used, the first: {broken[0]}; the others are kept in "
-            f"'{target / WORK_FOLDER}': repair or remove these, and the same command goes on"
+            f"{len(broken)} of {len(tasks)} images cannot be used, the first: {broken[0]}; masks of the others are "
+            f"kept in '{target / WORK_FOLDER}': repair or remove these images, then run the same command again"
         )
 
 
@@ -169,16 +169,16 @@ def _refuse_foreign(target: Path, overwrite: bool) -> None:
     for link in (folder, target / WORK_FOLDER):
         if link.is_symlink():  # an untrusted capture could redirect masks anywhere
             raise OgPointcloudError(
-                f"{link} is a link to '{link.readlink()}'; expected a folder of the capture's own, as nothing is "
-                "written through links: remove it, or give another folder (-o DIR)"
+                f"{link} is a link to '{link.readlink()}'; expected a real folder, as nothing is written "
+                "through links: remove the link, or give another folder (-o DIR)"
             )
     if overwrite or (folder / MADE_NAME).is_file():
         return
     found = folder if folder.is_dir() and any(folder.iterdir()) else features
     if found.exists():
         raise OgPointcloudError(
-            f"{found} was not made by this command and would be replaced; expected none: give another folder (-o DIR), "
-            "or --overwrite"
+            f"{found} was not made by this command and would be replaced; expected nothing there: give another folder "
+            "(-o DIR), or --overwrite"
         )
 
 

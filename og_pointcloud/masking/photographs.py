@@ -56,7 +56,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
     if missing:
         raise SceneError(
             f"{capture}: {len(missing)} of {len(files)} posed images are not found, e.g. '{missing[0]}'; expected all: "
-            "masks are made from images, so copy them there or take them out of the pose file"
+            "masks are made from images, so copy them there or remove them from the pose file"
         )
     named = zip(poses.names, poses.images, files, strict=True)
     return tuple(_photograph(name, image, file) for name, image, file in named if file is not None)
@@ -66,8 +66,8 @@ def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
     whole = image.camera if image.face is None else image.face.whole
     # Checked here, not when the image is processed: a night of work must not end with a wrong size.
     cure = (
-        "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
-        "pixels as stored)"
+        "fix the width and height in the pose file, or rotate the image (EXIF orientation is ignored: poses are for "
+        "the pixels as stored)"
     )
     require_scaled(f"{file} is", image_size(file), (whole.width, whole.height), cure)
     if image.face is None or not image.face.name:

@@ -35,13 +35,13 @@ def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attenti
         )  # fmt: skip
     except Exception as error:  # many types, some of safetensors' own
         raise SceneError(
-            f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a whole {classes[kind]} "
-            "with weights in .safetensors: fetch it again, or save it again with save_pretrained"
+            f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a complete "
+            f"{classes[kind]} with weights in .safetensors: fetch it again, or save it again with save_pretrained"
         ) from None
     if missing := sorted(report["missing_keys"]):
         raise SceneError(
-            f"{folder} lacks {len(missing)} of the weights of a {classes[kind]}, '{missing[0]}' first: name a folder "
-            "with the whole model"
+            f"{folder} lacks {len(missing)} of the weights of a {classes[kind]}, such as '{missing[0]}': give a folder "
+            "with the complete model"
         )
     return model.eval(), kind
 
@@ -60,16 +60,16 @@ def read_config(folder: Path, *names: str) -> dict[str, Any]:
 def _model_type(folder: Path, classes: Mapping[str, str]) -> str:
     if not (folder / "config.json").is_file():
         raise SceneError(
-            f"{folder} is no transformers folder: it has no config.json; expected a model's (of an OpenCLIP model, "
-            "fetch the repository that holds it for transformers)"
+            f"{folder} is not a transformers folder: it has no config.json; expected a model folder (for an OpenCLIP "
+            "model, fetch the repository that has it for transformers)"
         )
     config = read_config(folder, "config.json")
     kind = str(config.get("model_type"))
     if kind not in classes or not hasattr(transformers, classes[kind]):
         raise SceneError(
-            f"{folder}: model_type is {kind!r:.40}; expected {', '.join(classes)}, as far as the installed "
-            f"transformers {transformers.__version__} has them"
+            f"{folder}: model_type is {kind!r:.40}; expected one of {', '.join(classes)} that the installed "
+            f"transformers {transformers.__version__} has"
         )
     if "quantization_config" in config:
-        raise SceneError(f"{folder} is quantized; expected a model in float32 or float16, whose weights alone are read")
+        raise SceneError(f"{folder} is quantized; expected float32 or float16: only such weights are read")
     return kind

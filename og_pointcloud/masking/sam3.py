@@ -96,7 +96,7 @@ def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
     """(1, T) ids of each word."""
     file = loaded.folder / "tokenizer.json"
     if not file.is_file():
-        raise SceneError(f"{loaded.folder} has no tokenizer.json, which words need: fetch the whole model again")
+        raise SceneError(f"{loaded.folder} has no tokenizer.json, which words need: fetch the complete model again")
     config = getattr(loaded.model.config, "detector_config", loaded.model.config).text_config
     try:
         tokenizer = open_tokenizer(file.read_bytes(), config.max_position_embeddings, config.vocab_size)

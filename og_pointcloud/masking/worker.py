@@ -74,7 +74,7 @@ def read_work(file: Path) -> dict[str, NDArray[Any]]:
         with np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise SceneError(f"{file} cannot be read ({error}): remove it, and the same command makes it again") from None
+        raise SceneError(f"{file} cannot be read ({error}): remove it and run the same command again") from None
 
 
 def open_proposer(text: str, words: Sequence[str] = (), images_before: int | None = None) -> MaskProposer:
@@ -91,8 +91,8 @@ def open_proposer(text: str, words: Sequence[str] = (), images_before: int | Non
         if kind != "sam" or not name or not words:
             needs = "tracks" if images_before is not None else "words"
             raise SceneError(
-                f"{needs} are asked of proposer '{text}'{'' if words else ' without words'}; expected words with SAM 3 "
-                "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both, or with a folder of id PNGs"
+                f"proposer '{text}' is asked for {needs}{'' if words else ' without words'}; expected words with SAM 3 "
+                "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both or with a folder of id PNGs"
             )
         # Imported on demand, like all proposers below: torch takes seconds, and not everybody has it.
         from og_pointcloud.masking.sam3 import FollowedWords, NamedThings

@@ -115,7 +115,7 @@ def identical_values() -> Answer:
 
 
 @refuses(
-    OgPointcloudError, "row 0 of a codebook's input is [nan, nan]", "expected finite values", "leave such points out"
+    OgPointcloudError, "row 0 of the codebook's input is [nan, nan]", "expected finite values", "leave out such points"
 )
 def values_not_a_number() -> object:
     """k-means of NaN."""

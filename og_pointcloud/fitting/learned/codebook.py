@@ -254,8 +254,8 @@ def _check(values: NDArray[np.floating], weight: NDArray[np.floating]) -> None:
     if wrong.any():
         row = int(np.argmax(wrong))
         raise OgPointcloudError(
-            f"row {row} of a codebook's input is {values[row][:6].tolist()} with weight {weight[row]}; expected finite "
-            "values and weights of at least 0: leave such points out"
+            f"row {row} of the codebook's input is {values[row][:6].tolist()} with weight {weight[row]}; expected "
+            "finite values and a weight of at least 0: leave out such points"
         )
 
 

@@ -148,7 +148,7 @@ class FeatureObjective:
         if len(kept) == 0:
             raise SceneError(
                 f"none of the {len(weight)} masks shows a Gaussian; expected at least one: make masks, and check that "
-                "poses and cloud share one frame"
+                "poses and cloud are in the same frame"
             )
         self._weights = _int32(table.weights[kept][:, self.shown])
         self._weights.sort_indices()  # so that rows of the features are read in order

@@ -90,7 +90,7 @@ class RenderedViews:
             self.views.append(view)
         if not self.views:
             raise SceneError(
-                f"none of the {len(views)} views has a mask that Gaussians cover by {settings.covered_share} or more; "
+                f"none of the {len(views)} views has a mask of which Gaussians cover {settings.covered_share} or more; "
                 "expected at least one: make masks, check poses, or lower covered_share"
             )
         self.masked_pixels = pixels / len(self.views)
@@ -168,7 +168,7 @@ def device_of(name: str) -> torch.device:
     known |= {"cuda": gpus[0]} if gpus else {}
     if name not in known:
         raise OgPointcloudError(
-            f"device is '{name:.40}', of which torch knows none here; expected one of {', '.join(known)}"
+            f"device is '{name:.40}', which torch does not find here; expected one of {', '.join(known)}"
         )
     return torch.device(known[name])
 
