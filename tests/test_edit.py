@@ -512,7 +512,7 @@ def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
     out = str(tmp_path / "out.ply")
     for words, message in (
         (["remove", str(bundle), "--id", "one", "-o", out], "--id is 'one'"),
-        (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "a file that is read"),
+        (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "which is an input"),
         (["recolor", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
     ):
         assert message in error_of(capsys, "edit", *words)

@@ -454,7 +454,7 @@ def test_a_fit_that_cannot_be_written_is_kept(tiny_capture, tmp_path, capsys, mo
     (tmp_path / "full").mkdir()
     assert main(["fit", str(tiny_capture.folder), "-o", str(tmp_path / "full" / "s.ogpc")]) == 2
     said = capsys.readouterr().err
-    assert "cannot be written (No space left on device): the fit is kept in" in said
+    assert "cannot be written (No space left on device): the fit was saved as" in said
     assert len(og.load(said.partition("kept in '")[2].partition("'")[0]).instances) > 0
 
 
@@ -591,7 +591,7 @@ def test_names_of_files_that_are_no_utf8(bundle, tmp_path, capsys):
     assert json.loads((tmp_path / "s.json").read_text()) == {"file": str(scene)}
     capsys.readouterr()
     said = error_of(capsys, "index", tmp_path, "-o", tmp_path / "atlas")
-    assert "k\\udcfcche' holds bytes that are no UTF-8: rename the file or folder" in said
+    assert "k\\udcfcche' contains bytes that are not UTF-8: rename the file or folder" in said
 
 
 def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):

@@ -266,7 +266,7 @@ def _check_output(output: StrPath, inputs: Iterable[StrPath]) -> None:
     for source in inputs:
         if path.exists() and Path(source).exists() and path.samefile(source):
             raise OgPointcloudError(
-                f"the output is '{path}', a file that is read; expected another name: originals stay"
+                f"the output is '{path}', which is an input; expected another name: inputs are kept"
             )
 
 

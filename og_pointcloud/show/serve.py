@@ -58,7 +58,7 @@ def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None
     """
     empty = [title for title, live in scenes.items() if len(live.xyz) == 0]
     if empty or not scenes:
-        raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no point to show; expected at least one")
+        raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no points to show; expected at least one")
     settings = settings or ServeSettings()
     unit_up(settings.up)  # raises if it is no direction
     _check_address(settings.host, settings.port)
