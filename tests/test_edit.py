@@ -502,9 +502,9 @@ def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
     assert run("edit", "remove", bundle, "--id", "2", "--cloud", tmp_path / "all.spz", "-o", rest) == 0
     assert len(og.read_points(rest)) == (~chosen).sum()
     assert run("segment", bundle, "-o", tmp_path / "plain.spz") == 2
-    assert "holds splats alone; expected those that were asked about (--points" in capsys.readouterr().err
+    assert "stores only splats; expected those that were labelled (--points" in capsys.readouterr().err
     assert run("edit", "extract", bundle, "--id", "2", "-o", tmp_path / "plain.spz") == 2
-    assert "plain.spz holds splats alone, the cloud has plain points" in capsys.readouterr().err
+    assert "plain.spz stores only splats, the cloud has plain points" in capsys.readouterr().err
 
 
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):

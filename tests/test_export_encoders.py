@@ -174,7 +174,7 @@ def test_weights_that_do_not_fit(model_folder, tmp_path):
 
 def test_what_a_text_encoder_needs(model_folder, tmp_path):
     shutil.copytree(model_folder, tmp_path / "model")
-    with pytest.raises(OgPointcloudError, match=r"no place for the name; expected \{\}"):
+    with pytest.raises(OgPointcloudError, match=r"no slot for the name; expected \{\}"):
         exporter.export_text_encoder(model_folder, tmp_path / "out", feature_space=SPACE, templates=["a photo"])
     (tmp_path / "model" / "tokenizer.json").unlink()
     with pytest.raises(OgPointcloudError, match=r"holds no tokenizer; expected tokenizer\.json, or vocab\.json"):

@@ -82,7 +82,7 @@ def test_no_graph_but_ours_reaches_a_runtime(bundle, tmp_path, monkeypatch, chan
         pytest.skip("the older graph has other numbers there")
     hostile = with_graph(bundle if file == "new" else file, tmp_path / "s.ogpc", change)
     monkeypatch.setattr("og_pointcloud.ask.query_graph.open_session", None)
-    with pytest.raises(BundleError, match=r"query\.onnx.*not to be trusted"):
+    with pytest.raises(BundleError, match=r"query\.onnx.*do not trust the file"):
         og.load(hostile)
 
 
@@ -203,7 +203,7 @@ def test_a_carried_encoder_of_another_space_answers_nothing(tmp_path):
     files = encoder_with(feature_space="other/space", width=OUT)
     path = write_bundle(room(100), tmp_path / "s.ogpc")
     path = forged(path, path, {f"text_encoder/{name}": data for name, data in files.items()})
-    with pytest.raises(FeatureSpaceError, match=f"of feature space 'other/space', the scene of '{SPACE}'"):
+    with pytest.raises(FeatureSpaceError, match=f"has feature space 'other/space', the scene has '{SPACE}'"):
         og.segment(path, ["low"])
 
 
@@ -469,7 +469,7 @@ def test_files_that_travel_hold_no_path(tmp_path):
     work = tmp_path / "SECRET" / "work"
     assert main(["fit", str(capture.folder), "-o", str(path), "--work", str(work)]) == 0
     members = members_of(path)
-    assert b"text_features.npz is of feature space 'another'" in members["manifest.json"]
+    assert b"text_features.npz has feature space 'another'" in members["manifest.json"]
     assert not any(b"SECRET" in data for data in members.values())
 
 

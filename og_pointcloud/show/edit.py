@@ -162,7 +162,7 @@ class _Cloud:
         if Path(output).suffix == ".spz":
             notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
             if not holds_gaussians(elements):
-                raise SceneError(f"{output} holds splats alone, the cloud has plain points; expected .ply, or splats")
+                raise SceneError(f"{output} stores only splats, the cloud has plain points; expected .ply, or splats")
             write_spz(output, gaussians_from_ply(elements))
         else:
             write_ply(output, elements, [f"edited by og-pointcloud: {changed} points {verb}"])
