@@ -111,7 +111,7 @@ def test_a_click_that_missed_and_a_word_that_fits_nothing_are_refused(scene, spl
         og.edit.remove(scene, og.pick(scene, FAR + 500), tmp_path / "out.ply", cloud=splats)
     nothing = og.select(scene, {"moon": -scene.vocabulary.vectors.sum(axis=0)})
     assert not nothing.fitting
-    with pytest.raises(OgPointcloudError, match=r"'moon' fits none of 9 instances.*give its id"):
+    with pytest.raises(OgPointcloudError, match=r"'moon' fits none of 9 instances.*pass an id"):
         og.edit.remove(scene, nothing, tmp_path / "out.ply", cloud=splats)
 
 
@@ -120,7 +120,7 @@ def test_what_was_found_in_another_scene_is_refused(scene, splats, tmp_path):
     selection = og.select(other, WORDS[1])
     hit = og.pick(other, other.xyz[np.flatnonzero(other.instance_ids == 2)[0]])
     for what in (selection, selection[0], hit):
-        with pytest.raises(OgPointcloudError, match=f"the {type(what).__name__} .* they are of two scenes"):
+        with pytest.raises(OgPointcloudError, match=f"the {type(what).__name__} .* expected one from this scene"):
             og.edit.remove(scene, what, tmp_path / "out.ply", cloud=splats)
     again = LabelledScene.from_cloud(replace(scene.cloud))
     assert og.edit.remove(again, og.select(scene, WORDS[1]), tmp_path / "out.ply", cloud=splats).instances
@@ -394,8 +394,8 @@ def test_properties_that_only_one_has_are_told(tmp_path):
     done = og.edit.insert(base, other, tmp_path / "out.ply")
     assert vertices(done.path)["curvature"].tolist() == [1] * 4 + [0] * 3
     assert done.notes == (
-        "curvature are 0 for the inserted points, which had none",
-        "label of the inserted points are left out, which the cloud does not have",
+        "curvature are 0 for the inserted points, which lack them",
+        "label of the inserted points are left out: the cloud does not have them",
     )
 
 
@@ -422,7 +422,7 @@ def test_plain_points_and_splats_do_not_mix(tmp_path):
     plain, splats = plain_file(tmp_path / "plain.ply", np.eye(3)), tmp_path / "splats.ply"
     write_ply(splats, {"vertex": join_columns(gaussian_columns(np.eye(3)))})
     for pair in ((plain, splats), (splats, plain)):
-        with pytest.raises(SceneError, match="two of a kind"):
+        with pytest.raises(SceneError, match="expected the same kind"):
             og.edit.insert(*pair, tmp_path / "out.ply")
 
 

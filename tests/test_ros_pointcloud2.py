@@ -139,7 +139,7 @@ HOSTILE = {
     "a field beyond the point": ({"point_step": 11}, "field 'z' of a PointCloud2 spans bytes 8 to 12"),
     "a huge count": ({"fields": [PointField("x", 0, 7, 2**32 - 1)]}, "spans bytes 0 to 17179869180"),
     "no such type": ({"fields": [PointField("x", 0, 9, 1)]}, "datatype 9; expected 1"),
-    "twice one name": ({"fields": [PointField("x", 0), PointField("x", 4)]}, "comes twice"),
+    "twice one name": ({"fields": [PointField("x", 0), PointField("x", 4)]}, "appears twice"),
     "no fields": ({"fields": None}, "fields of a PointCloud2 are damaged"),
     "no PointField": ({"fields": ["x", "y", "z"]}, "fields of a PointCloud2 are damaged"),
     "no offset": ({"fields": [PointField("x", "four")]}, "fields of a PointCloud2 are damaged"),
@@ -266,7 +266,7 @@ def corners_of(bbox):
 
 
 def test_a_result_of_another_scene_is_refused(scene, result):
-    with pytest.raises(og.OgPointcloudError, match="they are of two scenes"):
+    with pytest.raises(og.OgPointcloudError, match="they are from different scenes"):
         to_detections(scene.instances[:1], result)
 
 

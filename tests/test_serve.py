@@ -160,8 +160,8 @@ def test_the_legend_has_the_colors_of_the_points(pages, live):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--host", "203.0.113.5"], "nothing can listen at '203.0.113.5'"),
-        (["--host", "no such host"], "nothing can listen at 'no such host'"),
+        (["--host", "203.0.113.5"], "cannot listen on '203.0.113.5'"),
+        (["--host", "no such host"], "cannot listen on 'no such host'"),
         (["--port", "99999"], "the port is 99999; expected a number from 0"),
         (["--labels", "appel"], "did you mean 'apple'"),
         (["room.ogpc", "--cloud", "x.ply"], "--cloud is for one scene, but 2 are given"),
