@@ -143,7 +143,7 @@ def test_another_cloud_takes_the_instances_of_the_nearest_points(scene, tmp_path
         expected = xyz[scene.instances_at(xyz) == 3]
         np.testing.assert_array_equal(stacked(vertices(done.path), "xyz"), expected)
         assert len(expected) > 10
-        assert "took the instance of the nearest" in done.notes[0]
+        assert "took the instance of the nearest scene point" in done.notes[0]
     with pytest.raises(OgPointcloudError, match="none of its 900 points lies within"):
         og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=plain_file(tmp_path / "far.ply", scene.xyz - FAR))
 
@@ -178,9 +178,9 @@ def test_originals_are_never_overwritten(scene, splats, tmp_path):
     before = splats.read_bytes()
     (tmp_path / "link.ply").symlink_to(splats)
     for output in (splats, tmp_path / "link.ply", tmp_path / "." / "splats.ply"):
-        with pytest.raises(OgPointcloudError, match="originals stay"):
+        with pytest.raises(OgPointcloudError, match="inputs are kept"):
             og.edit.remove(scene, 3, output, cloud=splats)
-        with pytest.raises(OgPointcloudError, match="originals stay"):
+        with pytest.raises(OgPointcloudError, match="inputs are kept"):
             og.edit.insert(plain_file(tmp_path / "p.ply", scene.xyz), splats, output)
     with pytest.raises(OgPointcloudError, match=r"ends in \.ply"):
         og.edit.remove(scene, 3, tmp_path / "out.npz", cloud=splats)

@@ -132,8 +132,8 @@ def test_no_points(cloud):
 
 
 HOSTILE = {
-    "cut off": ({"data": b"123"}, "holds 3 bytes; expected 24"),
-    "too long": ({"data": bytes(25)}, "holds 25 bytes; expected 24"),
+    "cut off": ({"data": b"123"}, "has 3 bytes; expected 24"),
+    "too long": ({"data": bytes(25)}, "has 25 bytes; expected 24"),
     "more points than bytes": ({"width": 2**32 - 1}, "expected 51539607540"),
     "rows that overlap": ({"height": 2, "width": 2, "row_step": 12, "data": bytes(36)}, "rows of 12"),
     "a field beyond the point": ({"point_step": 11}, "field 'z' of a PointCloud2 spans bytes 8 to 12"),

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     print(selection)
     if selection.unknown:
-        print(f"no feature that a word could be compared with: {counted(selection.unknown, 'instance')}")
+        print(f"no feature to compare with words: {counted(selection.unknown, 'instance')}")
     if not selection.calibrated:
         print(f"not calibrated: scores are cosines. {common.calibration_hint(arguments.bundle)}")
     if selection.fitting:

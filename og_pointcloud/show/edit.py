@@ -239,8 +239,8 @@ def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None
             "cloud that the .ogpc was made from, or another of the same place in the same frame"
         )
     return ids, (
-        f"{cloud} has {len(xyz)} points, the scene {len(scene.cloud)}, or they differ: each took that of the "
-        f"nearest one, and {far} have none within reach",
+        f"{cloud} has {len(xyz)} points, the scene {len(scene.cloud)}, or they differ: each took the instance "
+        f"of the nearest scene point, and {far} have none within reach",
     )
 
 
