@@ -50,7 +50,7 @@ def add(parser: Parser) -> None:
     option("--seed", "N", "seed of all random choices (default: %(default)s)", type=int, default=0)
     option("--memory", "4GB", "a mask table larger than this goes to disk (default: half of the free memory)")
     option("--tile-points", "N", "fit in tiles of this many points (default: only if memory requires it)", type=int)
-    option("--work", "DIR", "keeps views, so that a killed fit continues (default: OUT.ogpc.work)", type=replaceable)
+    option("--work", "DIR", "keeps views, so a killed fit can continue (default: OUT.ogpc.work)", type=replaceable)
     add_output(parser, "--rerun", endings=(".rrd",), help="also write the views and what they show, for Rerun's viewer")
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
     if work.exists() and not holds_map(work):  # it is removed at the end
         raise OgPointcloudError(f"--work is '{work}', which has other files than a map; expected a new folder name")
     if work.exists() and not arguments.resume:
-        raise OgPointcloudError(f"'{work}' has an interrupted map: add --resume, or remove it")
+        raise OgPointcloudError(f"'{work}' contains an interrupted map: add --resume, or remove it")
     frames = BagFrames(arguments.bag, arguments.frame)
     mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
     refused, taken = {}, 0

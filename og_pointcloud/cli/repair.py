@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
         if arguments.repairs:
             raise OgPointcloudError("--undo takes no repairs: leave out one or the other")
         file.unlink(missing_ok=True)
-        print(f"{capture} has no repairs: it is read as it is")
+        print(f"{capture} has no repairs: its files are read as they are")
         return
     stated = [] if arguments.only else [str(repair) for repair in read_repairs(capture)]
     new = [str(Repair.parse(text)) for text in arguments.repairs]

@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> None:
     if alone and len(arguments.bundles) > 1:
         raise OgPointcloudError(f"{alone} is for one scene, but {len(arguments.bundles)} are given; expected only one")
     if arguments.cloud and arguments.before:
-        raise OgPointcloudError("--cloud and --before are both given; expected one: visits are shown as fitted")
+        raise OgPointcloudError("--cloud and --before are both given; expected one: --before shows visits as fitted")
     from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.formats.points import read_points

@@ -231,8 +231,8 @@ class LiveScene:
         return Answer(answer.title, (*answer.lines, line), answer.bars, answer.note)
 
     def _match_text(self, match: Match) -> str:
-        rather = f" ({match.rival} fits better)" if not match.fits and match.rival else ""
-        return f"instance {match.instance}{rather}"
+        better = f" ({match.rival} fits better)" if not match.fits and match.rival else ""
+        return f"instance {match.instance}{better}"
 
 
 def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
