@@ -455,7 +455,7 @@ def test_a_fit_that_cannot_be_written_is_kept(tiny_capture, tmp_path, capsys, mo
     assert main(["fit", str(tiny_capture.folder), "-o", str(tmp_path / "full" / "s.ogpc")]) == 2
     said = capsys.readouterr().err
     assert "cannot be written (No space left on device): the fit was saved as" in said
-    assert len(og.load(said.partition("kept in '")[2].partition("'")[0]).instances) > 0
+    assert len(og.load(said.partition("saved as '")[2].partition("'")[0]).instances) > 0
 
 
 # No path of this machine in a file that travels -----------------------------------------------------------------------
