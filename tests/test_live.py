@@ -170,7 +170,7 @@ def test_clicks_find_what_pick_finds(origin):
         assert live.lit == ({around[0]} if around[0] >= 0 else None)
         if around[0] >= 0:
             assert answer.lines[0].startswith(f"instance {around[0]} · ")
-            assert answer.lines[-1].endswith("% sure")
+            assert answer.lines[-1].startswith("certainty that the point belongs to it: ")
             assert answer.bars == live.instances[around[0]].words
         else:
             assert answer.lines == ("no instance",)
