@@ -249,7 +249,7 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
         assert plotter.og.add_boxes(unknown) is None
     holes = mesh.og.segment(["plum"], scene)
     holes.points[:7] = np.nan
-    with pytest.warns(UserWarning, match="7 of 3,000 points hold NaN"):
+    with pytest.warns(UserWarning, match="7 of 3,000 points contain NaN"):
         plotter.og.add_segmentation(holes, names=False, legend=False)
     plotter.view_isometric()
     assert tuple(label_colors(np.array([0]))[0].tolist()) in colors_seen(plotter)

@@ -93,7 +93,7 @@ def decoded(messages, topic):
 def test_a_bag_that_is_packed_as_whole_files_is_refused_before_it_is_unpacked(scene, tmp_path):
     source = write_drive(tmp_path / "drive", scene, compressed=CompressionMode.FILE)
     for path in (source, next(source.glob("*.zst*"))):
-        with pytest.raises(og.SceneError, match=r"compressed as whole files .*: 'ros2 bag convert'"):
+        with pytest.raises(og.SceneError, match=r"compressed as whole files .*: use 'ros2 bag convert'"):
             label_bag(path, tmp_path / "out", og.Segmenter(scene, WORDS))
 
 

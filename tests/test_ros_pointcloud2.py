@@ -147,7 +147,7 @@ HOSTILE = {
     "no z": ({"fields": [PointField("x", 0), PointField("y", 4)]}, r"field 'z' .* is absent \(its fields: x, y\)"),
     "no field at all": ({"fields": [], "point_step": 12}, r"is absent \(its fields: none\)"),
     "three x": (
-        {"fields": [PointField("x", 0, 7, 3), PointField("y"), PointField("z")]}, "field 'x' .* holds 3 values",
+        {"fields": [PointField("x", 0, 7, 3), PointField("y"), PointField("z")]}, "field 'x' .* has 3 values",
     ),
     "points of no bytes": ({"fields": [], "point_step": 0, "row_step": 0, "data": b""}, "points of 0 bytes"),
     "a negative width": ({"width": -1}, "width of a PointCloud2 is -1"),
