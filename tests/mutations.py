@@ -422,6 +422,6 @@ MUTATIONS = (
     ),
     Mutation(
         "paths in files that travel", "bundle/vocabulary.py",
-        'reason = f"{own} is', 'reason = f"{file} is', trust("files_that_travel_hold_no_path"),
+        'reason = f"{own} has', 'reason = f"{file} has', trust("files_that_travel_hold_no_path"),
     ),
 )  # fmt: skip

@@ -143,7 +143,7 @@ def test_integer_and_half_precision_tensors(asked):
     for what in (torch.device("cpu"), torch.eye(3).to_sparse()):
         with pytest.raises(SceneError, match="no points"):
             og.segment(what, WORDS, scene)
-    with pytest.raises(OgPointcloudError, match=r"the place is .*; expected three finite world coordinates"):
+    with pytest.raises(OgPointcloudError, match=r"the position is .*; expected three finite world coordinates"):
         og.pick(scene, torch.ones(3).to_sparse())
 
 
@@ -386,7 +386,7 @@ def test_spz_holds_splats_in_the_colors_of_their_labels(tmp_path):
     found = og.read_points(result.save(tmp_path / "out.spz", points))
     assert np.abs(found.rgb.astype(int) - result.colors).max() <= 2
     for other in (None, splats(39)):
-        with pytest.raises(og.OgPointcloudError, match=r"out.spz holds splats alone; expected .*--points"):
+        with pytest.raises(og.OgPointcloudError, match=r"out.spz stores only splats; expected .*--points"):
             result.save(tmp_path / "out.spz", other)
 
 

@@ -613,7 +613,7 @@ def test_a_cloud_that_lies_elsewhere_is_told_with_both_boxes(fitted):
     words = {"wall": fitted.instances.descriptors[0]}
     moved = fitted.xyz_world + np.array([1.5, 0, 0])
     with pytest.warns(
-        UserWarning, match=r"too far from the scene, so that other labels may be wrong.* points span .*, the scene "
+        UserWarning, match=r"too far from the scene, so other labels may be wrong.* points span .*, the scene "
     ):
         og.segment(moved, words, fitted)
     with warnings.catch_warnings():

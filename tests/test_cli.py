@@ -194,7 +194,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
     out.mkdir()
     code, _, stderr = run(capsys, "fit", tiny_capture.folder, "-o", out / "s.ogpc", "--json", out / "run.json")
     assert code == 130
-    assert stderr.splitlines()[-1].startswith("interrupted: what was not done")
+    assert stderr.splitlines()[-1].startswith("interrupted: unfinished results are not written")
     assert list(out.iterdir()) == []
 
 
@@ -205,7 +205,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("fitt",), "did you mean 'fit'"),
         (("fit",), "CAPTURE"),
         (("fit", "capture", "-o", "s.ogpc", "--mask-levle", "large"), "did you mean '--mask-level'"),
-        (("fit", "capture", "-o", "s.ogpc", "--mask", "large"), "'--mask' is unknown"),
+        (("fit", "capture", "-o", "s.ogpc", "--mask", "large"), "'og-pointcloud fit' does not accept '--mask'"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "quick"), "quick"),
         (("fit", "capture", "-o", "s.zip"), "expected a name that ends in .ogpc"),
         (("fit", "capture", "-o", "s.ogpc", "--json", "s.ogpc"), "expected a name that ends in .json"),
@@ -222,12 +222,12 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("segment", "s.ogpc", "-o", "a.ply", "--output", "b.ply"), "--output is given twice"),
         (("fit", "capture", "-o", "s.ogpc", "--seed", "0", "--seed", "1"), "--seed is given twice"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "fast", "--mode", "fast"), "twice; expected once ("),
-        (("pick", "s.ogpc", "--xyz", "1,2,3", "--view", "a"), "--view is given with --xyz alone"),
+        (("pick", "s.ogpc", "--xyz", "1,2,3", "--view", "a"), "--view is given, but --xyz alone needs no camera"),
         (("compare", "a.ogpc", "b.ogpc", "--up", "z"), "--up is 'z' without --html"),
         (("compare", "a.ogpc", "b.ogpc", "--html", "c.html", "--up", "w"), "--up is 'w'; expected x, y, z, "),
         (("view", "a.ogpc", "--html", "c.html", "--up", "w"), "--up is 'w'; expected x, y, z, "),
         (("serve", "a.ogpc", "--up", "w"), "--up is 'w'; expected x, y, z, "),
-        (("import", "house.e57", "-o", "house.ogpc"), "-o is house.ogpc; expected the name of a folder"),
+        (("import", "house.e57", "-o", "house.ogpc"), "-o is house.ogpc; expected a folder name"),
         (("report", "capture", "--quick", "--knob", "mode"), "not allowed with"),
     ],
 )  # fmt: skip

@@ -270,5 +270,5 @@ def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):
     assert distance_to_surface(cloud.xyz_world).max() < 0.03
     assert cloud.rgb is not None
     assert len(read_capture(tmp_path).points) == len(cloud)
-    assert "is there already, and stays" in error_of(capsys, "fuse", tmp_path)
+    assert "already exists and is kept" in error_of(capsys, "fuse", tmp_path)
     assert "unit" in error_of(capsys, "fuse", tmp_path, "--depth-unit", "0", "-o", tmp_path / "b.ply")

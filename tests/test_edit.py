@@ -111,7 +111,7 @@ def test_a_click_that_missed_and_a_word_that_fits_nothing_are_refused(scene, spl
         og.edit.remove(scene, og.pick(scene, FAR + 500), tmp_path / "out.ply", cloud=splats)
     nothing = og.select(scene, {"moon": -scene.vocabulary.vectors.sum(axis=0)})
     assert not nothing.fitting
-    with pytest.raises(OgPointcloudError, match=r"'moon' fits none of 9 instances.*give its id"):
+    with pytest.raises(OgPointcloudError, match=r"'moon' fits none of 9 instances.*pass an id"):
         og.edit.remove(scene, nothing, tmp_path / "out.ply", cloud=splats)
 
 
@@ -120,7 +120,7 @@ def test_what_was_found_in_another_scene_is_refused(scene, splats, tmp_path):
     selection = og.select(other, WORDS[1])
     hit = og.pick(other, other.xyz[np.flatnonzero(other.instance_ids == 2)[0]])
     for what in (selection, selection[0], hit):
-        with pytest.raises(OgPointcloudError, match=f"the {type(what).__name__} .* they are of two scenes"):
+        with pytest.raises(OgPointcloudError, match=f"the {type(what).__name__} .* expected one from this scene"):
             og.edit.remove(scene, what, tmp_path / "out.ply", cloud=splats)
     again = LabelledScene.from_cloud(replace(scene.cloud))
     assert og.edit.remove(again, og.select(scene, WORDS[1]), tmp_path / "out.ply", cloud=splats).instances
@@ -143,7 +143,7 @@ def test_another_cloud_takes_the_instances_of_the_nearest_points(scene, tmp_path
         expected = xyz[scene.instances_at(xyz) == 3]
         np.testing.assert_array_equal(stacked(vertices(done.path), "xyz"), expected)
         assert len(expected) > 10
-        assert "took the instance of the nearest" in done.notes[0]
+        assert "took the instance of the nearest scene point" in done.notes[0]
     with pytest.raises(OgPointcloudError, match="none of its 900 points lies within"):
         og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=plain_file(tmp_path / "far.ply", scene.xyz - FAR))
 
@@ -178,9 +178,9 @@ def test_originals_are_never_overwritten(scene, splats, tmp_path):
     before = splats.read_bytes()
     (tmp_path / "link.ply").symlink_to(splats)
     for output in (splats, tmp_path / "link.ply", tmp_path / "." / "splats.ply"):
-        with pytest.raises(OgPointcloudError, match="originals stay"):
+        with pytest.raises(OgPointcloudError, match="inputs are kept"):
             og.edit.remove(scene, 3, output, cloud=splats)
-        with pytest.raises(OgPointcloudError, match="originals stay"):
+        with pytest.raises(OgPointcloudError, match="inputs are kept"):
             og.edit.insert(plain_file(tmp_path / "p.ply", scene.xyz), splats, output)
     with pytest.raises(OgPointcloudError, match=r"ends in \.ply"):
         og.edit.remove(scene, 3, tmp_path / "out.npz", cloud=splats)
@@ -394,8 +394,8 @@ def test_properties_that_only_one_has_are_told(tmp_path):
     done = og.edit.insert(base, other, tmp_path / "out.ply")
     assert vertices(done.path)["curvature"].tolist() == [1] * 4 + [0] * 3
     assert done.notes == (
-        "curvature are 0 for the inserted points, which had none",
-        "label of the inserted points are left out, which the cloud does not have",
+        "curvature are 0 for the inserted points, which lack them",
+        "label of the inserted points are left out: the cloud does not have them",
     )
 
 
@@ -422,7 +422,7 @@ def test_plain_points_and_splats_do_not_mix(tmp_path):
     plain, splats = plain_file(tmp_path / "plain.ply", np.eye(3)), tmp_path / "splats.ply"
     write_ply(splats, {"vertex": join_columns(gaussian_columns(np.eye(3)))})
     for pair in ((plain, splats), (splats, plain)):
-        with pytest.raises(SceneError, match="two of a kind"):
+        with pytest.raises(SceneError, match="expected the same kind"):
             og.edit.insert(*pair, tmp_path / "out.ply")
 
 
@@ -502,9 +502,9 @@ def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
     assert run("edit", "remove", bundle, "--id", "2", "--cloud", tmp_path / "all.spz", "-o", rest) == 0
     assert len(og.read_points(rest)) == (~chosen).sum()
     assert run("segment", bundle, "-o", tmp_path / "plain.spz") == 2
-    assert "holds splats alone; expected those that were asked about (--points" in capsys.readouterr().err
+    assert "stores only splats; expected those that were labelled (--points" in capsys.readouterr().err
     assert run("edit", "extract", bundle, "--id", "2", "-o", tmp_path / "plain.spz") == 2
-    assert "plain.spz holds splats alone, the cloud has plain points" in capsys.readouterr().err
+    assert "plain.spz stores only splats, the cloud has plain points" in capsys.readouterr().err
 
 
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
@@ -512,7 +512,7 @@ def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
     out = str(tmp_path / "out.ply")
     for words, message in (
         (["remove", str(bundle), "--id", "one", "-o", out], "--id is 'one'"),
-        (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "a file that is read"),
+        (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "which is an input"),
         (["recolor", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
     ):
         assert message in error_of(capsys, "edit", *words)

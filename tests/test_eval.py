@@ -135,7 +135,7 @@ def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
     assert report["miou"] == pytest.approx(0.75)
     # Without a bank no instance may abstain: as asked and as forced are one.
     assert report["forced_miou"] == report["miou"]
-    assert "2 scenes, 2 of the 10 of the published table" in out
+    assert "2 scenes, 2 of the 10 in the published table" in out
 
 
 def test_a_scene_that_abstains_is_also_scored_as_if_it_might_not(scannet, capsys):
@@ -176,7 +176,7 @@ def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
 
 
 def test_a_missing_or_empty_scene_is_one_error(scannet, capsys):
-    assert "has no labels of 'scene9999_00'" in error_of(capsys, *command(scannet, "--scenes", "scene9999_00"))
+    assert "has no labels for 'scene9999_00'" in error_of(capsys, *command(scannet, "--scenes", "scene9999_00"))
     prediction = scannet / "p/scene0062_00.ogpc"
     prediction.write_bytes(b"")
     assert str(prediction) in error_of(capsys, *command(scannet))

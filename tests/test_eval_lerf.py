@@ -131,7 +131,7 @@ def test_a_miniature_data_set_by_hand(data, capsys):
     best = report["means"]["best"]
     assert best["miou"] == pytest.approx(((1 + 1 / 2 + 1 / 9 + 3 / 4) / 4 + 1 / 4) / 2)
     assert best["accuracy"] == pytest.approx((3 / 4 + 0) / 2)
-    assert "5 pairs of 2 scenes; the published table has 208 of 4" in out
+    assert "5 pairs in 2 scenes; the published table: 208 in 4" in out
 
 
 def test_a_word_bank_lets_a_text_select_nothing(data):
@@ -217,7 +217,7 @@ def test_labels_that_fit_no_pose_are_refused(data, capsys):
     write_labels(data / "d", "teatime", "frame_00003", [("cup", outline(0, 0, 4))])
     assert "frame 'frame_00003' has none of the" in error_of(capsys, *command(data))
     ramen = command(data, "--scenes", "ramen")
-    assert "has no labels of 'ramen'; it has figurines, teatime" in error_of(capsys, *ramen)
+    assert "has no labels for 'ramen'; it has figurines, teatime" in error_of(capsys, *ramen)
     camera = data / "d/figurines/sparse/0/cameras.txt"
     camera.write_text(camera.read_text().replace("20 10", "20 20"))
     assert "expected the same aspect ratio" in error_of(capsys, *command(data, "--scenes", "figurines"))

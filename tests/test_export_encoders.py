@@ -174,7 +174,7 @@ def test_weights_that_do_not_fit(model_folder, tmp_path):
 
 def test_what_a_text_encoder_needs(model_folder, tmp_path):
     shutil.copytree(model_folder, tmp_path / "model")
-    with pytest.raises(OgPointcloudError, match=r"no place for the name; expected \{\}"):
+    with pytest.raises(OgPointcloudError, match=r"no slot for the name; expected \{\}"):
         exporter.export_text_encoder(model_folder, tmp_path / "out", feature_space=SPACE, templates=["a photo"])
     (tmp_path / "model" / "tokenizer.json").unlink()
     with pytest.raises(OgPointcloudError, match=r"has no tokenizer; expected tokenizer\.json, or vocab\.json"):
@@ -248,7 +248,7 @@ def test_the_image_command(model_folder, tmp_path, capsys):
     assert main(arguments) == 0
     assert open_encoder(tmp_path / "out").crops == WITH_CONTEXT
     capsys.readouterr()
-    assert "is no folder and no model" in error_of(capsys, "export", "image", tmp_path / "none")
+    assert "is neither a folder nor a downloaded model" in error_of(capsys, "export", "image", tmp_path / "none")
 
 
 def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, monkeypatch):
@@ -258,7 +258,7 @@ def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, mo
     (model / "refs").mkdir()
     for main_is in ("", "../../..", "c" * 40):
         (model / "refs" / "main").write_text(main_is)
-        assert f"'{SPACE}' is no folder and no model that was fetched" in error_of(capsys, "export", "text", SPACE)
+        assert f"'{SPACE}' is neither a folder nor a downloaded model" in error_of(capsys, "export", "text", SPACE)
     (model / "refs" / "main").write_text("b" * 40 + "\n")
     shutil.copytree(model_folder, model / "snapshots" / ("b" * 40))
     assert main(["export", "text", SPACE]) == 0

@@ -282,15 +282,15 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     broken.mkdir()
     assert main(["fit", str(captures[0]), str(broken), "--out", str(out), "--json", str(report)]) == 2
     said = capsys.readouterr()
-    assert "1 fitted, 0 there already, 1 failed" in said.out
+    assert "1 fitted, 0 already there, 1 failed" in said.out
     assert f"failed: {broken}" in said.err
     assert said.err.count(str(broken)) == 1
     assert "1 of 2 captures failed" in said.err
     assert [fit["state"] for fit in json.loads(report.read_text())["fits"]] == ["fitted", "failed"]
     assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}
-    assert "0 fitted, 1 there already" in output_of(capsys, "fit", captures[0], "--out", out)
+    assert "0 fitted, 1 already there" in output_of(capsys, "fit", captures[0], "--out", out)
     assert "expected --out DIR" in error_of(capsys, "fit", captures[0], captures[1], "-o", tmp_path / "x.ogpc")
-    assert "--work is for a single file" in error_of(capsys, "fit", captures[0], "--out", out, "--work", tmp_path / "w")
+    assert "--work needs a single" in error_of(capsys, "fit", captures[0], "--out", out, "--work", tmp_path / "w")
 
 
 @pytest.mark.slow

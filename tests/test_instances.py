@@ -170,7 +170,7 @@ def test_any_way_to_name_a_scene(bundle):
 
 @pytest.mark.parametrize("words", [-1, 1.5, None, True])
 def test_words_a_row_are_counted(words):
-    with pytest.raises(og.OgPointcloudError, match=rf"words is {words}; expected how many a row names, from 0"):
+    with pytest.raises(og.OgPointcloudError, match=rf"words is {words}; expected a number of words per row, from 0"):
         og.instance_table(room(600), words=words)
 
 

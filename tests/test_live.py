@@ -170,7 +170,7 @@ def test_clicks_find_what_pick_finds(origin):
         assert live.lit == ({around[0]} if around[0] >= 0 else None)
         if around[0] >= 0:
             assert answer.lines[0].startswith(f"instance {around[0]} · ")
-            assert answer.lines[-1].endswith("% sure")
+            assert answer.lines[-1].startswith("certainty that the point belongs to it: ")
             assert answer.bars == live.instances[around[0]].words
         else:
             assert answer.lines == ("no instance",)
@@ -183,7 +183,7 @@ def test_how_sure_is_that_of_the_point_that_was_clicked():
     live, down = LiveScene(scene), np.array([0, 0, -1.0])
     for point in np.flatnonzero(scene.instance_ids >= 0)[::100]:
         answer = live.click(scene.xyz[point] - down, down, 100.0)
-        assert answer.lines[-1] == f"that its point is part of it: {scene.certainty[point]:.0%} sure"
+        assert answer.lines[-1] == f"certainty that the point belongs to it: {scene.certainty[point]:.0%}"
 
 
 def test_another_cloud_is_shown_with_the_instances_of_the_scene(scene):

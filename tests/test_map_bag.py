@@ -76,7 +76,7 @@ def test_a_folder_of_other_files_is_no_map_and_stays(tmp_path, capsys, more):
     work.mkdir()
     (work / "thesis.txt").write_text("keep")
     assert main(["map", str(bag), "-o", str(tmp_path / "room.ogpc"), "--work", str(work), *more]) == 2
-    assert "holds other files than a map" in capsys.readouterr().err
+    assert "has other files than a map" in capsys.readouterr().err
     assert (work / "thesis.txt").read_text() == "keep"
 
 

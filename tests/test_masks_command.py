@@ -198,7 +198,7 @@ def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
 def test_the_demo_encoder_is_not_taken_without_a_word(tmp_path, capsys):
     make_capture(tmp_path / "c", 1)
     assert main(["masks", str(tmp_path / "c")]) == 0
-    assert "knows the demo room's furniture alone" in capsys.readouterr().err
+    assert "knows only the demo room's furniture" in capsys.readouterr().err
     assert main(["masks", str(tmp_path / "c"), *QUICKLY]) == 0
     assert "demo room" not in capsys.readouterr().err
 
@@ -212,7 +212,7 @@ def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
     assert main(command) == 0
     second = capsys.readouterr()
     told, counts = second.out.split("\n", 1)
-    assert told.startswith("all 3 images have these masks already: nothing to do")
+    assert told.startswith("all 3 images already have these masks: nothing to do")
     assert counts.split(" (")[0] == first.out.split(" (")[0]  # so many masks in so many images
     assert {file: file.stat().st_mtime_ns for file in sorted((tmp_path / "c").rglob("*")) if file.is_file()} == state
 

@@ -201,7 +201,7 @@ def test_places_find_what_query_points_find(tmp_path):
         ("abc", None, "three finite world coordinates"),
         ([[0], [0, 0]], None, "three finite world coordinates"),
         ((0, 0, np.inf), None, "three finite world coordinates"),
-        ((0, 0, 0), (3, 4), "expected it with a Camera"),
+        ((0, 0, 0), (3, 4), "expected it only with a Camera"),
     ],
 )
 def test_bad_places_are_refused(where, uv, text):

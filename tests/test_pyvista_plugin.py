@@ -138,7 +138,7 @@ def test_nothing_labelled_is_said(scene):
 
 def test_the_scene_is_found_as_everywhere(scene, bundle):
     mesh = pv.PolyData(scene.xyz[:20])
-    with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
+    with pytest.raises(og.OgPointcloudError, match="no scene to query"):
         mesh.og.segment(["apple"])
     assert np.array_equal(mesh.og.segment(["apple"], bundle)["og_instance"], scene.instance_ids[:20])
 
@@ -249,7 +249,7 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
         assert plotter.og.add_boxes(unknown) is None
     holes = mesh.og.segment(["plum"], scene)
     holes.points[:7] = np.nan
-    with pytest.warns(UserWarning, match="7 of 3,000 points hold NaN"):
+    with pytest.warns(UserWarning, match="7 of 3,000 points contain NaN"):
         plotter.og.add_segmentation(holes, names=False, legend=False)
     plotter.view_isometric()
     assert tuple(label_colors(np.array([0]))[0].tolist()) in colors_seen(plotter)
@@ -291,7 +291,7 @@ def test_a_click_shows_the_instance_and_its_words(plotter, scene):
 
 
 def test_a_click_asks_the_scene_drawn_last(plotter, bundle):
-    with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
+    with pytest.raises(og.OgPointcloudError, match="no scene to query"):
         plotter.og.enable_click_query()
     with pytest.raises(og.OgPointcloudError, match=r"call plotter\.og\.enable_click_query"):
         plotter.og.query((0, 0, 0))

@@ -445,7 +445,7 @@ def test_hostile_graphs_are_refused_before_a_runtime_sees_them(harm, tmp_path, m
         query_tables(model.SerializeToString())
     hostile = forged(path, tmp_path / "hostile.ogpc", {"query.onnx": model.SerializeToString()})
     monkeypatch.setattr("og_pointcloud.ask.query_graph.open_session", None)
-    with pytest.raises(BundleError, match="not to be trusted"):
+    with pytest.raises(BundleError, match="do not trust the file"):
         og.load(hostile)
 
 

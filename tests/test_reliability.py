@@ -240,7 +240,7 @@ def test_the_command_prints_it(tmp_path, capsys) -> None:
     main(["fit", str(capture), "-o", str(tmp_path / "s.ogpc"), "--json", str(tmp_path / "fit.json")])
     written = json.loads((tmp_path / "fit.json").read_text())["reliability"]
     assert written == og.load(tmp_path / "s.ogpc").cloud.reliability
-    assert f"reliability {written:.2f}: how far half of the views bear the labels out" in capsys.readouterr().out
+    assert f"reliability {written:.2f}: how well half of the views reproduce the labels" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("columns", [np.arange(50), np.array([3, 4, 40])])

@@ -93,7 +93,7 @@ def decoded(messages, topic):
 def test_a_bag_that_is_packed_as_whole_files_is_refused_before_it_is_unpacked(scene, tmp_path):
     source = write_drive(tmp_path / "drive", scene, compressed=CompressionMode.FILE)
     for path in (source, next(source.glob("*.zst*"))):
-        with pytest.raises(og.SceneError, match=r"packed as whole files .*: 'ros2 bag convert'"):
+        with pytest.raises(og.SceneError, match=r"compressed as whole files .*: use 'ros2 bag convert'"):
             label_bag(path, tmp_path / "out", og.Segmenter(scene, WORDS))
 
 
@@ -175,13 +175,13 @@ def test_topics_are_checked(scene, tmp_path):
     fails(tmp_path, "'/nose' is not in the bag; .* are /lidar/points", source, scene, topics=["/nose"])
     fails(tmp_path, "'/chatter' carries std_msgs/msg/String", source, scene, topics=["/chatter"])
     label_bag(source, tmp_path / "twice", og.Segmenter(scene, WORDS))
-    fails(tmp_path, "has a topic '/lidar/points/labelled' already", tmp_path / "twice", scene)
+    fails(tmp_path, "already has a topic '/lidar/points/labelled'", tmp_path / "twice", scene)
 
 
 def test_what_is_no_bag(scene, tmp_path):
-    fails(tmp_path, "is no bag; expected a folder", tmp_path / "none", scene)
+    fails(tmp_path, "is not a bag; expected a folder", tmp_path / "none", scene)
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
-    fails(tmp_path, "is a bag of ROS 1; .* rosbags-convert --src", tmp_path / "old.bag", scene)
+    fails(tmp_path, "is a ROS 1 bag; .* rosbags-convert --src", tmp_path / "old.bag", scene)
     (tmp_path / "text.db3").write_text("no database")
     fails(tmp_path, "cannot be read as a bag", tmp_path / "text.db3", scene)
 
@@ -190,7 +190,7 @@ def test_a_bag_that_breaks_off(scene, tmp_path):
     source = write_drive(tmp_path / "drive", scene)
     (file,) = source.glob("*.db3")
     os.truncate(file, file.stat().st_size // 2)
-    fails(tmp_path, "(breaks off|cannot be read as a bag)", source, scene)
+    fails(tmp_path, "cannot be read (fully|as a bag)", source, scene)
 
 
 def second_cloud_raises(monkeypatch, error):
@@ -231,7 +231,7 @@ def test_transforms_without_sense_are_left_out(scene, tmp_path):
             copies[static.id], 3, STORE.serialize_cdr(turned("base", "arm", (np.nan, 0, 0), 1, 0.0), static.msgtype)
         )
         bag.write(copies[static.id], 4, b"\0\1\0\0\7")
-    with pytest.warns(UserWarning, match="2 messages of transforms left out"):
+    with pytest.warns(UserWarning, match="2 transform messages left out"):
         assert label_bag(tmp_path / "odd", tmp_path / "out", og.Segmenter(scene, WORDS)).clouds == CLOUDS
 
 
@@ -243,7 +243,7 @@ def test_the_command(scene, tmp_path, capsys):
     command = ["ros-bag", source, "-o", tmp_path / "out", "--scene", scene.path, "--labels", "apple,pear"]
     code, out, _ = run(capsys, *command)
     assert code == 0
-    for text in ("apple", "unknown", "3 clouds", "points a second", "skipped 1 clouds", "next: ros2 bag play"):
+    for text in ("apple", "unknown", "3 clouds", "points per second", "skipped 1 clouds", "next: ros2 bag play"):
         assert text in out
     before = read(tmp_path / "out")
     assert "exists; expected a new name" in error_of(capsys, *command)

@@ -107,7 +107,7 @@ def test_what_waits_too_long_is_used_as_it_is_or_dropped(module, monkeypatch):
     now[0] += 61.0
     node.timers[0]()
     assert settled(node)._queue.mapper.points > 0  # depth alone is a frame
-    assert any("transform did not come" in text for text in warnings(node))
+    assert any("transform did not arrive" in text for text in warnings(node))
     assert not node._assembler.waiting
 
 

@@ -113,7 +113,7 @@ def test_setting_the_parameter_answers(node):
     (foreign,) = node.set_parameters([fake_ros.Parameter("use_sim_time", True)])
     assert (good.successful, unknown.successful, fixed.successful, foreign.successful) == (True, False, False, True)
     assert "unicorn" in unknown.reason
-    assert "at the start only" in fixed.reason
+    assert "only read at startup" in fixed.reason
     assert node.get_parameter("labels").value == ["plum"]
     assert names(node) == [WORDS, ["plum"]]
 
@@ -163,7 +163,7 @@ def test_a_cloud_that_waits_too_long_is_dropped(node, scene, module, monkeypatch
     assert not [line for line in node.logger.lines if line[0] == "warning"]
     now[0] += 0.2
     node.timers[0]()
-    assert "did not come within 0.5 s" in node.logger.lines[-1][1]
+    assert "did not arrive within 0.5 s" in node.logger.lines[-1][1]
     node._transforms.tell("map", "lidar", STAMP + 7, (1, 2, 3), TURN_LEFT)
     node.timers[0]()
     assert sent(node) == []

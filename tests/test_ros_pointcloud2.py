@@ -132,14 +132,14 @@ def test_no_points(cloud):
 
 
 HOSTILE = {
-    "cut off": ({"data": b"123"}, "holds 3 bytes; expected 24"),
-    "too long": ({"data": bytes(25)}, "holds 25 bytes; expected 24"),
+    "cut off": ({"data": b"123"}, "has 3 bytes; expected 24"),
+    "too long": ({"data": bytes(25)}, "has 25 bytes; expected 24"),
     "more points than bytes": ({"width": 2**32 - 1}, "expected 51539607540"),
     "rows that overlap": ({"height": 2, "width": 2, "row_step": 12, "data": bytes(36)}, "rows of 12"),
     "a field beyond the point": ({"point_step": 11}, "field 'z' of a PointCloud2 spans bytes 8 to 12"),
     "a huge count": ({"fields": [PointField("x", 0, 7, 2**32 - 1)]}, "spans bytes 0 to 17179869180"),
     "no such type": ({"fields": [PointField("x", 0, 9, 1)]}, "datatype 9; expected 1"),
-    "twice one name": ({"fields": [PointField("x", 0), PointField("x", 4)]}, "comes twice"),
+    "twice one name": ({"fields": [PointField("x", 0), PointField("x", 4)]}, "appears twice"),
     "no fields": ({"fields": None}, "fields of a PointCloud2 are damaged"),
     "no PointField": ({"fields": ["x", "y", "z"]}, "fields of a PointCloud2 are damaged"),
     "no offset": ({"fields": [PointField("x", "four")]}, "fields of a PointCloud2 are damaged"),
@@ -147,7 +147,7 @@ HOSTILE = {
     "no z": ({"fields": [PointField("x", 0), PointField("y", 4)]}, r"field 'z' .* is absent \(its fields: x, y\)"),
     "no field at all": ({"fields": [], "point_step": 12}, r"is absent \(its fields: none\)"),
     "three x": (
-        {"fields": [PointField("x", 0, 7, 3), PointField("y"), PointField("z")]}, "field 'x' .* holds 3 values",
+        {"fields": [PointField("x", 0, 7, 3), PointField("y"), PointField("z")]}, "field 'x' .* has 3 values",
     ),
     "points of no bytes": ({"fields": [], "point_step": 0, "row_step": 0, "data": b""}, "points of 0 bytes"),
     "a negative width": ({"width": -1}, "width of a PointCloud2 is -1"),
@@ -266,7 +266,7 @@ def corners_of(bbox):
 
 
 def test_a_result_of_another_scene_is_refused(scene, result):
-    with pytest.raises(og.OgPointcloudError, match="they are of two scenes"):
+    with pytest.raises(og.OgPointcloudError, match="they are from different scenes"):
         to_detections(scene.instances[:1], result)
 
 

@@ -124,7 +124,7 @@ def test_command(tmp_path, capsys):
     bundle = og.write_bundle(mugs_and_a_cup().cloud, tmp_path / "mugs.ogpc")
     out = output_of(capsys, "select", bundle, "mug")
     assert out.startswith("'mug' fits 2 of 3 instances\n* instance 0")
-    assert "no feature that a word could be compared with: 1 instance\n" in out
+    assert "no feature to compare with words: 1 instance\n" in out
     record = json.loads(output_of(capsys, "select", bundle, "mug", "--against", "", "--json"))
     assert [match["instance"] for match in record["matches"] if match["fits"]] == [0]
     error = error_of(capsys, "select", bundle, "zebra")

@@ -160,8 +160,8 @@ def test_the_legend_has_the_colors_of_the_points(pages, live):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--host", "203.0.113.5"], "nothing can listen at '203.0.113.5'"),
-        (["--host", "no such host"], "nothing can listen at 'no such host'"),
+        (["--host", "203.0.113.5"], "cannot listen on '203.0.113.5'"),
+        (["--host", "no such host"], "cannot listen on 'no such host'"),
         (["--port", "99999"], "the port is 99999; expected a number from 0"),
         (["--labels", "appel"], "did you mean 'apple'"),
         (["room.ogpc", "--cloud", "x.ply"], "--cloud is for one scene, but 2 are given"),
@@ -174,7 +174,7 @@ def test_bad_use_is_refused_in_one_line(pages, bundle, capsys, monkeypatch, opti
 
 def test_an_empty_scene_is_refused(pages, live, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
-    assert "empty has no point to show" in error_of(capsys, "serve", empty)
+    assert "empty has no points to show" in error_of(capsys, "serve", empty)
 
     with pytest.raises(og.SceneError, match=r"up is \(0, 0, 0\); expected a direction"):
         pages.serve({"room": live}, pages.ServeSettings(up=(0, 0, 0)))
@@ -202,7 +202,7 @@ def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(pages, bund
     try:
         lines = iter(process.stdout.readline, "")
         assert any(line.startswith("http://127.0.0.1:") for line in lines)
-        assert next(lines) == "for this machine alone; --host 0.0.0.0 lets others in, without a password\n"
+        assert next(lines) == "for this machine only; --host 0.0.0.0 lets others in, without a password\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
         assert "Traceback" not in process.stdout.read()

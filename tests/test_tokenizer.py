@@ -176,15 +176,15 @@ def test_without_tokenizers_the_extra_is_named(monkeypatch):
         ({"model": {"type": "WordPiece", "vocab": {}}}, "model is a 'WordPiece'"),
         (
             {"normalizer": {"type": "Replace", "pattern": {"Regex": "(a+)+$"}, "content": ""}},
-            r"looks for the pattern '\(a",
+            r"uses the pattern '\(a",
         ),
         (
             {"pre_tokenizer": {"type": "Split", "pattern": {"Regex": "(x|x)*y"}, "behavior": "Removed"}},
-            "for the pattern",
+            "uses the pattern",
         ),
         ({"model": {**clip_tokenizer([])["model"], "merges": ["a bc"]}}, "not in the form"),
         ({"model": {**clip_tokenizer([])["model"], "vocab": {"a": 0}}}, "lacks 256 of the 256 bytes"),
-        ({"model": {**clip_tokenizer([])["model"], "vocab": {"a": "0"}}}, "'0' stands where a token id"),
+        ({"model": {**clip_tokenizer([])["model"], "vocab": {"a": "0"}}}, "'0' is in the place of a token id"),
         ({"model": {**clip_tokenizer([])["model"], "dropout": 0.1}}, "dropout 0.1"),
         ({"model": None}, "not in the form"),
         ({"post_processor": {"type": "RobertaProcessing"}}, "not in the form"),

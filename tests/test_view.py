@@ -122,14 +122,14 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
     assert code == 0
     assert "none of 5 points has a label: 5 are too far from the scene" in stderr
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
-    assert "has no point to show" in error_of(capsys, "view", empty, "--html", tmp_path / "empty.html")
+    assert "has no points to show" in error_of(capsys, "view", empty, "--html", tmp_path / "empty.html")
     assert not (tmp_path / "empty.html").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--columns", "3"], "'--columns' is unknown"),
+        (["--columns", "3"], "does not accept '--columns'"),
         (["--html", "x.png"], "expected a name that ends in .html or .htm"),
         (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
         (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),

@@ -205,8 +205,8 @@ def _checked(points: ArrayLike) -> DoubleArray:
     xyz = _rows(points, fewest=1)
     if not (np.abs(xyz) <= MAX_COORDINATE).all():  # false for NaN
         raise SceneError(
-            f"points hold NaN, infinity or more than {MAX_COORDINATE:g}; expected finite coordinates: leave those "
-            "points out"
+            f"points contain NaN, infinity or values above {MAX_COORDINATE:g}; expected finite coordinates: leave "
+            "those points out"
         )
     return xyz
 

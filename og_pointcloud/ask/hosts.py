@@ -48,7 +48,7 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
         return _checked(pcd, kind)
     values = _READERS[host](pcd)
     if values is None:
-        raise SceneError(f"a {kind} of {host} has no points that can be asked: give its points as (N, 3)")
+        raise SceneError(f"a {kind} of {host} has no points to query: pass its points as (N, 3)")
     return _checked(values, kind)
 
 
@@ -83,7 +83,7 @@ def carried_scene(pcd: Any) -> Path | None:
     if beside.suffix == ".ogpc" and beside.is_file():
         return beside
     raise OgPointcloudError(
-        f"the dataset says that its labels came from '{named:.200}', which was not opened here and is not in this "
+        f"the dataset records that its labels came from '{named:.200}', which was not opened here and is not in this "
         "folder; expected scene=og.load('S.ogpc'), or its path"
     )
 
@@ -134,7 +134,7 @@ def _checked(values: Any, kind: str) -> NDArray[np.float64]:
     try:
         points = np.asarray(values)
     except ValueError as error:
-        raise SceneError(f"a {kind} is no array of points ({error}); expected shape (N, 3)") from None
+        raise SceneError(f"a {kind} is not an array of points ({error}); expected shape (N, 3)") from None
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise SceneError(
             f"points are a {kind} of {points.dtype} {points.shape}; expected numbers of shape (N, 3), x y z in the "

@@ -148,7 +148,7 @@ class Instances(Sequence[Instance]):
         row = operator.index(index)
         if not 0 <= row < len(self):
             raise IndexError(
-                f"{index} is no instance id of {len(self)}; expected 0 to {len(self) - 1}: -1 is background, "
+                f"{index} is not one of {len(self)} instance ids; expected 0 to {len(self) - 1}: -1 is background, "
                 "-2 unobserved, -3 too far from the scene"
             )
         return self._rows[row]
@@ -215,7 +215,7 @@ def list_instances(
     oriented boxes, if known. words: number of words per row.
     """
     if not isinstance(words, Integral) or isinstance(words, bool) or words < 0:
-        raise OgPointcloudError(f"words is {words!r}; expected how many a row names, from 0")
+        raise OgPointcloudError(f"words is {words!r}; expected a number of words per row, from 0")
     if up is not None:
         unit_up(up)  # raises now, not at the first box
     # Points sorted by id, in their own order within an id: each instance's points are one slice. Negative ids come

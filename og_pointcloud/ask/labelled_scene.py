@@ -376,7 +376,7 @@ def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
         return as_scene(pcd)
     if (carried := carried_scene(pcd)) is not None:
         return as_scene(carried)
-    raise OgPointcloudError("no scene to ask: pass scene=og.load('S.ogpc'), or its path, or segment a labelled cloud")
+    raise OgPointcloudError("no scene to query: pass scene=og.load('S.ogpc'), or its path, or segment a labelled cloud")
 
 
 def as_scene(source: SceneLike) -> LabelledScene:
@@ -392,7 +392,7 @@ def as_scene(source: SceneLike) -> LabelledScene:
         state = path.stat()
         return _load_once(path, state.st_mtime_ns, state.st_size)
     raise OgPointcloudError(
-        f"scene is a {type(source).__name__}; expected a scene, a LabelledCloud or the path of a .ogpc"
+        f"scene is a {type(source).__name__}; expected a scene, a LabelledCloud or the path of a .ogpc file"
     )
 
 
@@ -432,7 +432,7 @@ def _label_warning(result: Segmentation, scene: LabelledScene, are_own: bool, po
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
-    others = f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other labels may be wrong too"
+    others = f"{far} of {len(result)} points are {Reason.TOO_FAR}, so other labels may be wrong too"
     return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
@@ -445,20 +445,20 @@ def _misplacement(points: DoubleArray, far: int, scene: LabelledScene, pose: Arr
     enough, spacing, reach = len(sample) >= MIN_SAMPLE_POINTS, scene.cloud.spacing, scene.cloud.reach
     if enough and (step := float32_step(sample)) > spacing:
         return (
-            f"float32 rounded them to steps of {step:.3g}, the scene's points lie {spacing:.3g} apart: give them as "
-            "float64, or take an offset off before they become float32, and give it in pose="
+            f"float32 rounded them to steps of {step:.3g}, but the scene's points lie {spacing:.3g} apart: pass them "
+            "as float64, or subtract an offset before they become float32, and pass it in pose="
         )
     if pose is not None and (coarse := rounded_pose(pose, spacing)):
         return coarse
     if far > MISPLACED_SHARE * len(points):
         return (
-            f"the points span {span(points)}, the scene {span(scene.xyz)}, its reach is {reach:.4g}: bring them into "
-            "the scene's frame and unit"
+            f"the points span {span(points)}, the scene {span(scene.xyz)}, and its reach is {reach:.4g}: bring them "
+            "into the scene's frame and unit"
         )
     if enough and (width := _width(sample)) < reach < _width(scene.cloud.xyz) / WIDE_SCENE_REACHES:
         return (
-            f"all of them lie within {width:.3g}, where the scene, {_width(scene.cloud.xyz):.4g} wide, has hardly two "
-            "points: bring them into the scene's unit"
+            f"all of them lie within {width:.3g}, a range where the scene, {_width(scene.cloud.xyz):.4g} wide, has "
+            "hardly two points: bring them into the scene's unit"
         )
     return ""
 

@@ -140,7 +140,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
             warnings.warn(f"another point may be hit; {coarse}", stacklevel=2)
         point = _point_at_pixel(scene.cloud, where, uv_px)
     elif uv_px is not None:
-        raise OgPointcloudError(f"uv_px is given with a {type(where).__name__}; expected it with a Camera alone")
+        raise OgPointcloudError(f"uv_px is given with a {type(where).__name__}; expected it only with a Camera")
     else:
         point = _nearest_point(scene, where)
     if point == NO_POINT:
@@ -187,8 +187,8 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
     uv = numbers_of(uv_px)
     if uv.dtype.kind not in "fiu" or uv.shape != (2,) or not ((uv >= 0) & (uv < [camera.width, camera.height])).all():
         raise OgPointcloudError(
-            f"uv_px is {uv_px}; expected a pixel (column, row) of the camera's image, 0 to {camera.width} and 0 to "
-            f"{camera.height}, both less than the end"
+            f"uv_px is {uv_px}; expected a pixel of the camera's image: a column from 0 to below {camera.width}, and a "
+            f"row from 0 to below {camera.height}"
         )
     return int(front_points(cloud, camera)[int(uv[1]), int(uv[0])])
 
@@ -197,7 +197,7 @@ def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
     """Index of the nearest point within the scene's reach, the one that a query point finds, else NO_POINT."""
     world = numbers_of(place)
     if world.dtype.kind not in "fiu" or world.shape != (3,) or not np.isfinite(world).all():
-        raise OgPointcloudError(f"the place is {place}; expected three finite world coordinates x, y, z")
+        raise OgPointcloudError(f"the position is {place}; expected three finite world coordinates x, y, z")
     return int(scene.nearest.query(scene._local(world[None]))[0])
 
 

@@ -45,7 +45,7 @@ class QueryGraph:
             raise self._refused(f"takes {sorted(inputs)} and gives {sorted(outputs)}")
         shape = inputs["text"].shape
         if len(shape) != 2 or not isinstance(shape[1], int):
-            raise self._refused(f"takes text of shape {shape}, of no width")
+            raise self._refused(f"takes text of shape {shape}, without a fixed dimension")
         self._no_text = np.zeros((0, shape[1]), np.float32)
         if len(cloud):
             self._compare(cloud, np.random.default_rng())
@@ -59,10 +59,10 @@ class QueryGraph:
         instances, certain = (np.asarray(values) for values in answers)
         for values, dtype in zip((instances, certain), OUTPUTS.values(), strict=True):
             if values.shape != (len(local),) or values.dtype != dtype:
-                raise self._refused(f"answers {values.dtype} {values.shape} for {len(local)} points")
+                raise self._refused(f"answers with {values.dtype} {values.shape} for {len(local)} points")
         # Callers index arrays by these ids: an invalid one must not get that far.
         if len(local) and not (instances.min() >= TOO_FAR and instances.max() < self._instances):
-            raise self._refused("answers what is no instance of this file")
+            raise self._refused("answers with ids that are not instances of this file")
         return instances, certain
 
     def _compare(self, cloud: LabelledCloud, random: np.random.Generator) -> None:
@@ -77,7 +77,7 @@ class QueryGraph:
         instances, certain = self.look_up(places)
         expected = np.array([_brute_force_instance(cloud, place) for place in places])
         if wrong := int((certain & (instances != expected)).sum()):
-            raise self._refused(f"contradicts the file's own points and ids in {wrong} of {len(places)} places")
+            raise self._refused(f"contradicts the file's own points and ids at {wrong} of {len(places)} positions")
 
     def _refused(self, what: Any) -> BundleError:
         return BundleError(f"{self._path}: query.onnx {what}: write the file again")

@@ -93,8 +93,8 @@ class Segmentation:
             return None
         if len(certainty) != len(self):  # rows were selected by dataclasses.replace
             raise OgPointcloudError(
-                f"certainty is of {len(certainty):,} points, the result has {len(self):,}; expected one a point: give "
-                "the rows' as certainty_of"
+                f"certainty has {len(certainty):,} values, the result {len(self):,} points; expected one value per "
+                "point: pass those of the rows as certainty_of"
             )
         return certainty.copy()  # it may be the scene's
 
@@ -160,13 +160,13 @@ class Segmentation:
         """
         if not isinstance(path, (str, os.PathLike)):
             raise OgPointcloudError(
-                f"the file to save is {path!r:.80}; expected a name, with one of {', '.join(SAVED_AS)}"
+                f"the file to save is {path!r:.80}; expected a name that ends in one of {', '.join(SAVED_AS)}"
             )
         path, columns = Path(path), (self.xyz, self.colors, self.attributes, self.names)
         if path.suffix not in SAVED_AS:
             raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")
         if splats is not None and not isinstance(splats, Points):
-            raise OgPointcloudError(f"splats are a {type(splats).__name__}; expected those of og.read_points(FILE)")
+            raise OgPointcloudError(f"splats are a {type(splats).__name__}; expected those that og.read_points gives")
         if path.suffix == ".npz":
             self._save_arrays(path)
         elif path.suffix == ".spz":
@@ -189,7 +189,7 @@ class Segmentation:
         from og_pointcloud.formats.spz import write_spz
 
         if splats is None or len(splats.xyz) != len(self):
-            raise OgPointcloudError(f"{path} holds splats alone; expected those that were asked about (--points S.ply)")
+            raise OgPointcloudError(f"{path} stores only splats; expected those that were labelled (--points S.ply)")
         write_spz(path, splats, self.colors)
 
     def _save_arrays(self, path: Path) -> None:

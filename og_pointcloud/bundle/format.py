@@ -80,8 +80,8 @@ def manifest_json(manifest: Mapping[str, Any]) -> bytes:
         ) from None
     if len(text) > MAX_MANIFEST_BYTES:
         raise OgPointcloudError(
-            f"the manifest has {len(text)} bytes; expected at most {MAX_MANIFEST_BYTES}, which readers take: leave "
-            "entries out of the cloud's provenance"
+            f"the manifest has {len(text)} bytes; expected at most {MAX_MANIFEST_BYTES}, the readers' limit: remove "
+            "entries from the cloud's provenance"
         )
     return text
 

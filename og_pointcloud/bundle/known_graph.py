@@ -46,7 +46,7 @@ def query_tables(onnx: bytes) -> dict[str, NDArray[np.generic]]:
     check_graph(onnx)
     digest, constants, codes = _parsed(onnx)
     if digest not in KNOWN_GRAPHS:
-        raise ValueError("it is not the graph that such files have")
+        raise ValueError("it is not a graph that this format allows")
     tables = {name: constant for name, constant in constants.items() if name in TABLES} | {"codes": codes}
     return {name: np.frombuffer(table.data, DTYPES[table.kind]).reshape(table.shape) for name, table in tables.items()}
 
@@ -63,7 +63,7 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     model = list(message_fields(memoryview(onnx)))
     graph = [field for number, value in model if number == 7 for field in message_fields(value)]
     if {number for number, _ in model} - MODEL_FIELDS or {number for number, _ in graph} - GRAPH_FIELDS:
-        raise ValueError("it holds what no graph of ours does")
+        raise ValueError("it contains fields that our graphs do not have")
     named = [(text_of(value, 8), constant_of(value)) for number, value in graph if number == 5]
     constants = dict(named)
     nodes = [_Node(value) for number, value in graph if number == 1]
@@ -76,7 +76,7 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
         or counting is None
         or counting.inputs[0] not in constants
     ):
-        raise ValueError("it does not count as graphs of ours do")
+        raise ValueError("it does not count answer codes as our graphs do")
     # The digest covers versions, tables by kind, inputs and outputs by name, and every node in order.
     lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]
     lines += sorted(f"{name} {_kind(constant)}" for name, constant in constants.items() if name in TABLES)

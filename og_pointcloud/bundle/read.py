@@ -96,7 +96,7 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         infos = archive.infolist()
         for info in infos:
             if not ogpc.SAFE_NAME.fullmatch(info.filename):
-                raise _Refused(f"member name {info.filename!r:.80} is no plain relative path: it is not to be trusted")
+                raise _Refused(f"member name {info.filename!r:.80} is not a plain relative path: do not trust the file")
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
                 raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {ogpc.REBUILD}")
         # Members of the same name, or overlapping ones, could be read differently by other readers.
@@ -104,26 +104,26 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         total = sum(info.file_size for info in infos)
         if len(names) != len(infos) or len(infos) > ogpc.MAX_MEMBERS or total > size:
             raise _Refused(
-                f"{len(infos)} members of {len(names)} names claim {total} bytes in a file of {size}; expected unique "
-                f"names, at most {ogpc.MAX_MEMBERS}, that fit: the file is not to be trusted"
+                f"{len(infos)} members with {len(names)} names claim {total} bytes in a file of {size}; expected at "
+                f"most {ogpc.MAX_MEMBERS} members that fit, with unique names: do not trust the file"
             )
         carried = {info.filename: info.file_size for info in infos if info.filename.startswith(ogpc.CARRIED_ENCODER)}
         return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
     except ZIP_ERRORS as error:
         raise _Refused(
             f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
-            f"{ogpc.REBUILD}; a cloud or splat alone is no scene, og-pointcloud fit makes one of a capture"
+            f"{ogpc.REBUILD}; a cloud or splat alone is not a scene: og-pointcloud fit makes one from a capture"
         ) from None
 
 
 def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     if "manifest.json" not in members:
         holds = ", ".join(list(members)[:3]) or "nothing"
-        raise _Refused(f"a zip without manifest.json (it holds {holds}): not a .ogpc file; give the one that fit wrote")
+        raise _Refused(f"a zip without manifest.json (it has {holds}): not a .ogpc file; pass the one that fit wrote")
     manifest = _json(members, "manifest.json", ogpc.MAX_MANIFEST_BYTES)
     if not isinstance(manifest, dict) or manifest.get("format") != ogpc.FORMAT:
         seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
-        raise _Refused(f"its manifest says format {seen!r}; expected {ogpc.FORMAT!r}: give the file that fit wrote")
+        raise _Refused(f"its manifest says format {seen!r}; expected {ogpc.FORMAT!r}: pass the file that fit wrote")
     schema = manifest.get("schema_version")
     if not isinstance(schema, int) or schema < 1:
         raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {ogpc.REBUILD}")
@@ -143,7 +143,7 @@ def _json(members: dict[str, bytes], name: str, most: int) -> Any:
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise _Refused(f"{name} is no JSON ({error}): {ogpc.REBUILD}") from None
+        raise _Refused(f"{name} is not JSON ({error}): {ogpc.REBUILD}") from None
 
 
 def _check_members(manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int]) -> None:
@@ -167,7 +167,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     points, instances = _field(counts, "points", int, "counts/"), _field(counts, "instances", int, "counts/")
     xyz = _array(members, "arrays/xyz.npy", ("<f4",), (points, 3))
     if not np.isfinite(xyz).all():
-        raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
+        raise _Refused(f"arrays/xyz.npy contains NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
     ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGER_DTYPES, (points,)).astype(np.int32)
     ids.flags.writeable = False  # as all other arrays of a file are
     rgb = _array(members, ogpc.RGB, ("|u1",), (points, 3)) if ogpc.RGB in members else None
@@ -218,7 +218,7 @@ def _check_graph(
     try:
         tables = query_tables(onnx)
     except ValueError as error:
-        raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
+        raise _Refused(f"query.onnx: {error}: do not trust the file") from None
     # An answer code is an id, counted from TOO_FAR on.
     codes, rows = instances - TOO_FAR, (len(descriptors), max(descriptors.shape[1], 1))
     same = (
@@ -229,7 +229,7 @@ def _check_graph(
         and tables["descriptor_code"].tolist() == (descriptor_instance[:, None] - TOO_FAR).tolist()
     )
     if not same:
-        raise _Refused("query.onnx has other instances or descriptors than the file says: it is not to be trusted")
+        raise _Refused("query.onnx has other instances or descriptors than the file says: do not trust the file")
 
 
 def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
@@ -268,7 +268,7 @@ def _array(
     try:
         array = array_from_npy(members[name])
     except ValueError as error:
-        raise _Refused(f"member '{name}' is no .npy that can be read ({error}): {ogpc.REBUILD}") from None
+        raise _Refused(f"member '{name}' is not a readable .npy ({error}): {ogpc.REBUILD}") from None
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
     if array.dtype.str not in dtypes or not fits:
         expected = f"{' or '.join(dtypes)} {shape}"

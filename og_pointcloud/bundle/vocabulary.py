@@ -72,7 +72,7 @@ def scene_words(
         if given is not None:
             space.require(word_space, f"words of {file}")
         elif name != space.name or not space.accepts(word_space):
-            reason = f"{own} is of {word_space}, the masks are of {space}: encode the words with the masks' model"
+            reason = f"{own} has {word_space}, the masks have {space}: encode the words with the masks' model"
             left_out.append(left_out_entry(CAPTURE_WORDS[own], reason=reason))
             return None
         return words

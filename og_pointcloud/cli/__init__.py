@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.run(arguments)
             sys.stdout.flush()
     except KeyboardInterrupt:
-        print("interrupted: what was not done is not written; the same command does the rest", file=sys.stderr)
+        print("interrupted: unfinished results are not written; the same command does the rest", file=sys.stderr)
         return 130
     except BrokenPipeError:  # as by `| head`: nothing more may be printed, not even at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -89,13 +89,13 @@ def describe_error(error: Exception) -> str:
         return "out of memory"
     if isinstance(error, UnicodeEncodeError):  # bytes in a file name, which Python keeps as lone surrogates
         name = error.object[max(0, error.start - LONGEST_CELL // 2) :]
-        return f"'{printable(name, LONGEST_CELL)}' holds bytes that are no UTF-8: rename the file or folder"
+        return f"'{printable(name, LONGEST_CELL)}' contains bytes that are not UTF-8: rename the file or folder"
     if isinstance(error, OSError) and error.strerror:
         return printable(f"'{error.filename}': {error.strerror}" if error.filename else error.strerror)
     text = printable(str(error), None if isinstance(error, OgPointcloudError) else LONGEST_UNFORESEEN)
     if isinstance(error, (OgPointcloudError, MissingExtraError, OSError)):
         return text
-    return f"{type(error).__name__}: {text}; 'og-pointcloud --debug COMMAND ...' shows where: please report it"
+    return f"{type(error).__name__}: {text}; 'og-pointcloud --debug COMMAND ...' shows where: report it as a bug"
 
 
 def print_warning(message: Warning | str, *_: object) -> None:
@@ -104,7 +104,7 @@ def print_warning(message: Warning | str, *_: object) -> None:
 
 
 def build_parser() -> Parser:
-    parser = Parser(prog="og-pointcloud", description="Ask a point cloud or Gaussian splat for things by name.")
+    parser = Parser(prog="og-pointcloud", description="Find objects in a point cloud or Gaussian splat by name.")
     parser.add_argument("--version", action="version", version=f"og-pointcloud {og.__version__}")
     parser.add_argument("--debug", action="store_true", help="show where in the program an error came from")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -117,6 +117,4 @@ def build_parser() -> Parser:
 def describe_unknown_option(option: str, arguments: argparse.Namespace) -> str:
     known = arguments.parser._option_string_actions
     command = arguments.parser.prog
-    return (
-        f"'{option}' is unknown to '{command}'{did_you_mean(option.split('=')[0], known)} ('{command} --help' explains)"
-    )
+    return f"'{command}' does not accept '{option}'{did_you_mean(option.split('=')[0], known)} (see '{command} --help')"

@@ -43,7 +43,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-([\d.,][\d.,eE+-]*|[xyz])$")  # -1,2e-5,3 and -z are values
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
+        self.exit(2, f"error: {message} (see '{self.prog} --help')\n")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Adds a guess at what was meant."""
@@ -66,16 +66,16 @@ class Once(argparse.Action):
 
 SHARED: dict[str, dict[str, Any]] = {
     "capture": {"type": Path, "metavar": "CAPTURE", "help": "folder with images and poses"},
-    "bundle": {"type": Path, "metavar": "S.ogpc", "help": "what `fit` wrote"},
-    "--labels": {"metavar": "A,B,C", "help": 'names to choose among; "a, b" is one name (default: all known)'},
+    "bundle": {"type": Path, "metavar": "S.ogpc", "help": "file that `fit` wrote"},
+    "--labels": {"metavar": "A,B,C", "help": 'names to choose from; "a, b" is one name (default: all known)'},
     "--text-features": {
         "type": Path, "metavar": "F.npz",
-        "help": "names and vectors, from the scene's encoder (default: the scene's own words)",
+        "help": "names with vectors from the scene's encoder (default: the scene's own words)",
     },
-    "--gaussians": {"type": Path, "metavar": "F.ply", "help": "geometry, in place of the capture's own"},
-    "--cloud": {"type": Path, "metavar": "CLOUD", "help": "other points or splats of the place (default: the scene's)"},
-    "--up": {"metavar": "AXIS", "help": "what points up: x, y, z, -x, -y, -z or X,Y,Z (in pictures z by default)"},
-    "--frame": {"default": "map", "metavar": "F", "help": "what tf calls the frame of the map (default: %(default)s)"},
+    "--gaussians": {"type": Path, "metavar": "F.ply", "help": "geometry to use instead of the capture's own"},
+    "--cloud": {"type": Path, "metavar": "CLOUD", "help": "another cloud or splat of the place (default: the scene's)"},
+    "--up": {"metavar": "AXIS", "help": "up direction: x, y, z, -x, -y, -z or X,Y,Z (z by default in pictures)"},
+    "--frame": {"default": "map", "metavar": "F", "help": "name of the map's frame in tf (default: %(default)s)"},
     "--json": {"action": "store_true", "help": "print the result as JSON"},
 }  # fmt: skip
 """Options that mean the same in several commands."""
@@ -135,7 +135,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
             raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
         check_output(option, path, inputs)
         if path.resolve() in taken:
-            raise OgPointcloudError(f"{taken[path.resolve()]} and {option} are both '{path}'; expected two names")
+            raise OgPointcloudError(f"{taken[path.resolve()]} and {option} are both '{path}'; expected different names")
         taken[path.resolve()] = option
 
 
@@ -152,7 +152,7 @@ def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
         raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
     in_folder = any(source in resolved.parents for source in sources) and path.exists() and path.suffix != ".ogpc"
     if resolved in sources or in_folder:
-        raise OgPointcloudError(f"{option} is '{path}', a file that is read; expected another name, so that it stays")
+        raise OgPointcloudError(f"{option} is '{path}', which is an input; expected another name: inputs are kept")
     existing = next(parent for parent in resolved.parents if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise OgPointcloudError(f"{option} is '{path}', but '{existing}' is not a folder that can be written to")
@@ -230,7 +230,7 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         f"{shares[1]:.1%} background, {shares[2]:.1%} unobserved"
     )
     if report["reliability"] is not None:
-        print(f"reliability {report['reliability']:.2f}: how far half of the views bear the labels out, 0 to 1")
+        print(f"reliability {report['reliability']:.2f}: how well half of the views reproduce the labels, 0 to 1")
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
     if not report["calibrated"]:
         print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")
@@ -239,7 +239,7 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         labels = likely_words(cloud) if cloud.vocabulary else ("chair", "table")
         print_next("segment", output, "--labels", as_option(labels), "-o", labels_file(output))
     else:
-        print("no words are known yet: segment takes --text-features, or what export text makes of the masks' encoder")
+        print("no words are known yet: give segment --text-features, or run export text for the masks' encoder")
         print_next("instances", output)
 
 
@@ -276,8 +276,8 @@ def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledC
                 kept.parent.rmdir()
                 raise error from None
             raise OgPointcloudError(
-                f"'{output}' cannot be written ({error.strerror}): the fit is kept in '{kept}': move it where there is "
-                "room"
+                f"'{output}' cannot be written ({error.strerror}): the fit was saved as '{kept}': move it to where "
+                "there is room"
             ) from error
     return cloud
 
@@ -344,7 +344,7 @@ def numbers(text: str, option: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count:
-        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers with commas between them")
+        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers separated by commas")
     return values
 
 

@@ -1,4 +1,4 @@
-"""Say what changed between two visits: gone, new, moved, not seen again.
+"""List what changed between two visits: gone, new, moved, not seen again.
 
 og-pointcloud compare monday.ogpc friday.ogpc --json
 """
@@ -15,7 +15,7 @@ from og_pointcloud.errors import OgPointcloudError
 
 def add(parser: Parser) -> None:
     add_option(parser, "before", "A.ogpc", "the earlier visit", type=Path)
-    add_option(parser, "after", "B.ogpc", "the later one, in the same world frame", type=Path)
+    add_option(parser, "after", "B.ogpc", "the later visit, in the same world frame", type=Path)
     add_shared(parser, "--json", "--up")
     add_output(parser, "--html", endings=(".html",), help="also write a page that shows what changed")
 
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.mapping.changes import compare
 
     if arguments.up and not arguments.html:
-        raise OgPointcloudError(f"--up is '{arguments.up}' without --html; expected the page whose view it turns")
+        raise OgPointcloudError(f"--up is '{arguments.up}' without --html; expected both: it orients the page's view")
     up = np.array(direction(arguments.up or "z"), np.float64)  # fails before the work, if invalid
     before, after = load(arguments.before), load(arguments.after)
     changes = compare(before, after)

@@ -1,4 +1,4 @@
-"""Make a furnished room, fit it, ask it for things, score it and show it.
+"""Make a furnished room, fit it, query it by words, score it and show it.
 
 og-pointcloud demo -o out/demo
 """
@@ -14,9 +14,9 @@ from og_pointcloud.cli.common import Parser, add_option, check_output, require_r
 def add(parser: Parser) -> None:
     folder = "folder to fill (default: %(default)s)"
     parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help=folder)
-    add_option(parser, "--seed", "N", "another room (default: %(default)s)", type=int, default=0)
+    add_option(parser, "--seed", "N", "each seed makes a different room (default: %(default)s)", type=int, default=0)
     add_option(parser, "--mask-noise", "X", "0 clean, 1 realistic (default: %(default)s)", type=float, default=1.0)
-    alone = "also label the room from its images alone, without ready masks and features"
+    alone = "also label the room from its images only, without ready-made masks and features"
     parser.add_argument("--photographs", action=argparse.BooleanOptionalAction, default=True, help=alone)
 
 

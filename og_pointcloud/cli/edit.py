@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 VERBS = {"remove": "removed", "extract": "extracted", "recolor": "recolored"}
 SUMMARIES = {
     "remove": "Write the cloud without an object.",
-    "extract": "Write an object alone.",
+    "extract": "Write only an object.",
     "recolor": "Write the cloud with an object recolored.",
 }
 
@@ -33,12 +33,12 @@ def add(parser: Parser) -> None:
         operation = common.add_command(operations, name, run, f"{summary}\n\n{example}")
         common.add_shared(operation, "bundle", "--text-features", "--cloud", "--json")
         what = operation.add_mutually_exclusive_group(required=True)
-        common.add_option(what, "--word", "WORD", "every instance that it fits better than other words do")
+        common.add_option(what, "--word", "WORD", "all instances that this word fits better than other words do")
         common.add_option(what, "--id", "K,L", "instances by their ids (`og-pointcloud instances` lists them)")
-        common.add_option(what, "--xyz", "X,Y,Z", "the instance at a place in world coordinates")
-        near = "also unlabelled points so near, in spacings (default: 0)"
+        common.add_option(what, "--xyz", "X,Y,Z", "the instance at a position in world coordinates")
+        near = "also edit unlabelled points within this many spacings (default: 0)"
         common.add_option(operation, "--halo", "N", near, type=float, default=0.0)
-        endings, help = (".ply", ".spz"), "the edited cloud; .spz of splats"
+        endings, help = (".ply", ".spz"), "the edited cloud; .spz for splats"
         common.add_output(operation, "-o", "--output", endings=endings, required=True, help=help)
     common.add_option(operations.choices["recolor"], "--color", "R,G,B", "0 to 255 each", required=True)
 
@@ -65,7 +65,7 @@ def what_to_edit(arguments: argparse.Namespace) -> What:
     try:
         return [int(part) for part in arguments.id.split(",")]
     except ValueError:
-        raise OgPointcloudError(f"--id is '{arguments.id}'; expected numbers with commas between them") from None
+        raise OgPointcloudError(f"--id is '{arguments.id}'; expected numbers separated by commas") from None
 
 
 def print_edit(record: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Score labels against a data set's, or a capture's, own truth.
+"""Score labels against the ground truth of a data set or capture.
 
 og-pointcloud eval capture kitchen kitchen.ogpc
 """
@@ -34,18 +34,18 @@ def add(parser: Parser) -> None:
     add_path = partial(common.add_option, type=common.replaceable)
     capture, scannet, lerf = common.add_commands(parser, "protocol", run_capture, run_scannet, run_lerf)
     add_path(capture, "capture", "CAPTURE", "folder with gt.npz")
-    add_path(capture, "bundle", "S.ogpc", "what `fit` wrote of it")
-    add_path(capture, "--against", "OTHER.ogpc", "another: also the difference, less OTHER, paired")
+    add_path(capture, "bundle", "S.ogpc", "file that `fit` wrote for it")
+    add_path(capture, "--against", "OTHER.ogpc", "another file: also score the paired difference, minus OTHER")
     add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")
-    add_path(scannet, "--gaussians", "G", "folder with <scene>.ply, whose points of opacity below 0.1 are ignored")
-    add_path(lerf, "folder", "DIR", "with <scene>/sparse/0 and label/<scene>/*.json")
-    splats = "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what was fitted"
+    add_path(scannet, "--gaussians", "G", "folder with <scene>.ply; points of opacity below 0.1 are ignored")
+    add_path(lerf, "folder", "DIR", "folder with <scene>/sparse/0 and label/<scene>/*.json")
+    splats = "folder with <scene>.ply or <scene>/point_cloud/iteration_*/: the fitted Gaussians"
     add_path(lerf, "--gaussians", "G", splats, required=True)
     for data_set in (scannet, lerf):
         add_path(data_set, "--predictions", "P", "folder with <scene>.ogpc", required=True)
-        common.add_option(data_set, "--scenes", "A,B", "these scenes (default: all with labels in DIR)")
+        common.add_option(data_set, "--scenes", "A,B", "only these scenes (default: all with labels in DIR)")
     for protocol in (capture, scannet, lerf):
-        add_path(protocol, "--text-features", "F.npz", "words with vectors (default: the capture's, the scene's)")
+        add_path(protocol, "--text-features", "F.npz", "words with vectors (default: the capture's, else the scene's)")
         common.add_output(protocol, "--json", endings=(".json",), help="also write every score")
 
 
@@ -66,10 +66,10 @@ def run_capture(arguments: argparse.Namespace) -> None:
     score = score_capture(answer, truth)
     change = difference(answer, ask(arguments.against, truth, words), truth) if arguments.against else None
     name, interval = arguments.capture.resolve().name, score.interval
-    row = {"": name} | capture_cells(score) | ({"less the other": signed(change)} if change else {})
+    row = {"": name} | capture_cells(score) | ({"minus the other": signed(change)} if change else {})
     common.print_table(tuple(row), [tuple(row.values())])
     print(
-        "unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of the scene, not over points: "
+        "unknown counts as wrong; 'answered' leaves it out. The 95 % interval is over cubes of the scene, not points: "
         f"{interval.blocks} cubes of {interval.edge / answer.spacing:.0f} point spacings"
     )
     less = asdict(change) if change else None
@@ -95,7 +95,7 @@ def capture_cells(score: CaptureScore) -> dict[str, str]:
 
 
 def run_scannet(arguments: argparse.Namespace) -> None:
-    """ScanNet with 19, 15 and 10 classes; unknown counts as wrong, and beside it stands how often it is said.
+    """Score ScanNet with 19, 15 and 10 classes; unknown counts as wrong, and its share is printed.
 
     og-pointcloud eval scannet scans --predictions fitted --json scores.json
     """
@@ -117,7 +117,7 @@ def run_scannet(arguments: argparse.Namespace) -> None:
     ]
     common.print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
     published = sum(scene in SCENES for scene in truths)
-    scenes = f"{counted(len(truths), 'scene')}, {published} of the {len(SCENES)} of the published table"
+    scenes = f"{counted(len(truths), 'scene')}, {published} of the {len(SCENES)} in the published table"
     print(f"{scenes}; intervals are over scenes")
     if arguments.gaussians is None:
         print("no --gaussians: transparent points are not ignored")
@@ -166,7 +166,7 @@ def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floatin
         kind = "Gaussians" if points.are_gaussians else "points without opacity"
         raise OgPointcloudError(
             f"{folder / scene}.ply has {len(points)} {kind}; expected a Gaussian for each of the scene's {count} "
-            "points, in their order"
+            "points, in the same order"
         )
     return points.opacity
 
@@ -175,7 +175,7 @@ def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floatin
 
 
 def run_lerf(arguments: argparse.Namespace) -> None:
-    """LeRF-OVS: select by text, render, compare with the outlined objects (mIoU, IoU over 0.25).
+    """Score LeRF-OVS: select by text, render, compare with the outlined objects (mIoU, IoU over 0.25).
 
     og-pointcloud eval lerf lerf_ovs --predictions fitted --gaussians trained --text-features words.npz
     """
@@ -217,9 +217,7 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     intervals = [bootstrap(column) for every in pooled for column in (every, (every > MIN_IOU).astype(float))]
     rows.append(("95 % over pairs", "", *(spread((found.low, found.high)) for found in intervals)))
     common.print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
-    print(
-        f"{counted(total, 'pair')} of {counted(len(scenes), 'scene')}; the published table has {PUBLISHED_PAIRS} of 4"
-    )
+    print(f"{counted(total, 'pair')} in {counted(len(scenes), 'scene')}; the published table: {PUBLISHED_PAIRS} in 4")
     return {way: {"miou": miou, "accuracy": found} for way, (miou, found) in means.items()}
 
 
@@ -255,7 +253,7 @@ def without_nan(value: Any) -> Any:
 def known_scenes(folder: Path, known: list[str], wanted: list[str] | None) -> list[str]:
     missing = [name for name in wanted or () if name not in known]
     if missing:
-        raise OgPointcloudError(f"{folder} has no labels of '{missing[0]}'; it has {', '.join(known[:4])}")
+        raise OgPointcloudError(f"{folder} has no labels for '{missing[0]}'; it has {', '.join(known[:4])}")
     return wanted or known
 
 
@@ -264,7 +262,7 @@ def prediction_file(folder: Path, scene: str) -> Path:
     file = folder / f"{scene}.ogpc"
     if not file.is_file():
         raise OgPointcloudError(
-            f"{folder} has no {file.name}: a mean over other scenes is another figure; fit that scene, or name the "
+            f"{folder} has no {file.name}: a mean over other scenes is not comparable; fit that scene, or name the "
             "scenes to score"
         )
     return file

@@ -1,4 +1,4 @@
-"""Make a model's text or image encoder usable without torch.
+"""Export a model's text or image encoder, to use it without torch.
 
 og-pointcloud export text openai/clip-vit-base-patch32
 """
@@ -17,18 +17,18 @@ from og_pointcloud.errors import OgPointcloudError
 def add(parser: Parser) -> None:
     text, image = add_commands(parser, "half", run_text, run_image)
     for half in (text, image):
-        add_option(half, "model", "MODEL", "fetched OWNER/MODEL, or a folder of CLIP or SigLIP", type=Path)
-        where = "default: where scenes find it by themselves"
+        add_option(half, "model", "MODEL", "downloaded OWNER/MODEL, or a folder with a CLIP or SigLIP model", type=Path)
+        where = "folder to create (default: where scenes find it automatically)"
         half.add_argument("-o", "--output", type=Path, metavar="DIR", help=where)
-        add_option(half, "--feature-space", "OWNER/MODEL", "as scenes name it (default: what the model says)")
-    template = "what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})"
+        add_option(half, "--feature-space", "OWNER/MODEL", "name that scenes give it (default: the model's own)")
+    template = "text that a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})"
     add_option(text, "--template", "TEXT", template, action="append")
-    crops = "how masks are cut out unless a caller says otherwise (default: %(default)s)"
+    crops = "how masks are cropped if the caller does not say (default: %(default)s)"
     add_option(image, "--crops", None, crops, choices=("context", "langsplat"), default="context")
 
 
 def run_text(arguments: argparse.Namespace) -> None:
-    """Words -> vectors: any word can then be asked.
+    """Export the text encoder: it turns any word into a vector.
 
     og-pointcloud export text openai/clip-vit-base-patch32
     """
@@ -40,11 +40,11 @@ def run_text(arguments: argparse.Namespace) -> None:
     )
     print_export(folder, manifest, "texts")
     if arguments.output is not None:
-        print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # scenes of this feature space then find it")
+        print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # so that scenes of this feature space find it")
 
 
 def run_image(arguments: argparse.Namespace) -> None:
-    """Crops of masks -> vectors, for og-pointcloud masks.
+    """Export the image encoder: it turns crops of masks into vectors, for og-pointcloud masks.
 
     og-pointcloud export image openai/clip-vit-base-patch32
     """
@@ -68,7 +68,7 @@ def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | Non
     if folder := fetched_model(name):
         return folder, feature_space or name
     raise OgPointcloudError(
-        f"'{name}' is no folder and no model that was fetched; expected one of them: check the path, or fetch "
+        f"'{name}' is neither a folder nor a downloaded model; expected one of them: check the path, or download "
         "the model (hf download OWNER/MODEL)"
     )
 
@@ -76,7 +76,7 @@ def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | Non
 def print_export(folder: Path, manifest: Mapping[str, Any], compared: str) -> None:
     """Print what was made, and how far it is from torch. compared: what the manifest counts, 'texts' or 'images'."""
     parity = manifest["parity"]
-    print(f"feature space '{manifest['feature_space']}': width {manifest['width']}")
-    print(f"onnxruntime and torch differ by {parity['max_abs_error']:.1e} at most, over {parity[compared]} {compared}")
+    print(f"feature space '{manifest['feature_space']}': dimension {manifest['width']}")
+    print(f"onnxruntime and torch differ by at most {parity['max_abs_error']:.1e} over {parity[compared]} {compared}")
     size = sum(file["bytes"] for file in manifest["files"].values())
     print(f"wrote {folder} ({size / 1e6:.1f} MB)")

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     option = partial(common.add_option, parser)
-    option("atlas", "ATLAS", "what `index` wrote", type=Path)
+    option("atlas", "ATLAS", "file that `index` wrote", type=Path)
     option("words", "WORD", "words or phrases", nargs="+")
-    option("--within", "X,Y,Z,X,Y,Z", "two corners of a box, the low one first: things with their middle in it")
-    option("--scene", "NAME", "ask only this one, or those of a pattern: 'site3/*'; repeatable", action="append")
-    option("--top", "N", "how many (default: %(default)s)", type=int, default=20)
-    option("--lance", "URI", "search what `index --lance` wrote, not memory")
+    option("--within", "X,Y,Z,X,Y,Z", "two corners of a box, low one first: only instances with their center in it")
+    option("--scene", "NAME", "only this scene, or all that match, as 'site3/*' does; repeatable", action="append")
+    option("--top", "N", "number of results (default: %(default)s)", type=int, default=20)
+    option("--lance", "URI", "search the table that `index --lance` wrote, not memory")
     common.add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
     common.add_shared(parser, "--text-features", "--json")
 
@@ -55,13 +55,13 @@ def run(arguments: argparse.Namespace) -> None:
     if findings:
         common.print_table(("scene", "instance", "word", "score", "center", "size"), list(map(cells, findings)))
         if not (fitting := sum(finding.fits for finding in findings)):
-            print("nothing fits what was asked: no score is above one half")
+            print("nothing fits: no score is above one half")
         elif fitting < len(findings):
             print(f"{fitting} of these {len(findings)} fit: their scores are above one half")
     else:
-        print("nothing was found there: no instance with a feature has its middle in the box")
+        print("nothing was found there: no instance with a feature has its center in the box")
     if not all(finding.calibrated for finding in findings):
-        print("scores of scenes without a judge say how much better the word fits than other known words do")
+        print("without a word bank, a scene's scores say how much better the word fits than other known words do")
     if arguments.html:
         print(f"wrote {arguments.html}")
     if findings and findings[0].fits:  # a word that fits nothing would label all of a scene without a bank
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
         if file.is_file():
             common.print_next("view", file, "--labels", common.as_option([best.word]), *given)
         else:
-            print(f"{file} is there no longer: bring the index up to date")
+            print(f"{file} no longer exists: update the index")
 
 
 def cells(finding: Finding) -> tuple[str, ...]:

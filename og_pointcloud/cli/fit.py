@@ -38,29 +38,29 @@ def add(parser: Parser) -> None:
     option("capture", "CAPTURE", "folder with images and poses; several with --out", type=Path, nargs="+")
     target = parser.add_mutually_exclusive_group(required=True)
     add_output(target, "-o", "--output", endings=(".ogpc",), help="the file to write")
-    add_option(target, "--out", "DIR", "a folder for NAME.ogpc of each capture that has none there", type=replaceable)
-    option("--scheduler", "ADDRESS", "of a Dask cluster for captures, or tiles of one (default: this machine)")
+    add_option(target, "--out", "DIR", "folder for NAME.ogpc of each capture; existing ones are kept", type=replaceable)
+    option("--scheduler", "ADDRESS", "Dask cluster for captures, or tiles of one (default: this machine)")
     add_shared(parser, "--gaussians")
     option("--mode", None, "how to find instances (default: %(default)s)", choices=MODES, default=MODES[0])
     option("--schedule-share", "X", "shorten the published schedule (mode paper; default: 1)", type=float)
-    option("--mask-level", None, "of LangSplat masks (default: large)", choices=MASK_LEVELS)
-    option("--vocabulary", "F.npz", "words that can be asked (default: the capture's text_features.npz)", type=Path)
-    bank = "50 everyday words or more to judge labels by (default: the capture's word_bank.npz, else the encoder's)"
+    option("--mask-level", None, "level of LangSplat masks (default: large)", choices=MASK_LEVELS)
+    option("--vocabulary", "F.npz", "words to store (default: the capture's text_features.npz)", type=Path)
+    bank = "at least 50 everyday words to judge labels by (default: the capture's word_bank.npz, else the encoder's)"
     option("--word-bank", "F.npz", bank, type=Path)
-    option("--seed", "N", "of everything random (default: %(default)s)", type=int, default=0)
-    option("--memory", "4GB", "a larger table of masks goes to disk (default: half of what is free)")
-    option("--tile-points", "N", "fit in tiles of so many points (default: where one fit would not fit)", type=int)
-    option("--work", "DIR", "keeps views, so that a killed fit goes on (default: OUT.ogpc.work)", type=replaceable)
-    add_output(parser, "--rerun", endings=(".rrd",), help="also write the views and what they show for Rerun's viewer")
+    option("--seed", "N", "seed of all random choices (default: %(default)s)", type=int, default=0)
+    option("--memory", "4GB", "a mask table larger than this goes to disk (default: half of the free memory)")
+    option("--tile-points", "N", "fit in tiles of this many points (default: only if memory requires it)", type=int)
+    option("--work", "DIR", "keeps views, so a killed fit can continue (default: OUT.ogpc.work)", type=replaceable)
+    add_output(parser, "--rerun", endings=(".rrd",), help="also write the views and what they show, for Rerun's viewer")
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 
 
 def run(arguments: argparse.Namespace) -> None:
     alone = [name for name in ("work", "rerun") if getattr(arguments, name) is not None]
     if arguments.out is None and len(arguments.capture) > 1:
-        raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
+        raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for several")
     if arguments.out is not None and alone:
-        raise OgPointcloudError(f"--{alone[0]} is for a single file; expected -o S.ogpc with it, or leave it out")
+        raise OgPointcloudError(f"--{alone[0]} needs a single output; expected -o S.ogpc with it, or leave it out")
     from og_pointcloud.ask.hosts import import_plugin
 
     settings = fit_settings(arguments)
@@ -86,7 +86,7 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
         cloud = fit_capture(capture, options, work=work, executor=executor, progress=True)
     except KeyboardInterrupt:
         if views := kept_files(work, "view"):
-            print(f"kept in '{work}': {counted(views, 'view')}; the same command goes on behind them", file=sys.stderr)
+            print(f"kept in '{work}': {counted(views, 'view')}; the same command continues after them", file=sys.stderr)
         raise
     cloud = common.write_fit(cloud, Journal(False), arguments.output)
     if arguments.rerun:
@@ -116,7 +116,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     # Failures are listed last and end in an error, so that a script notices; fitted files stay.
     failed = [fit for fit in fits if fit.state == "failed"]
     there = len(fits) - len(made) - len(failed)
-    print(f"{len(made)} fitted, {there} there already, {len(failed)} failed, in {arguments.out}")
+    print(f"{len(made)} fitted, {there} already there, {len(failed)} failed, in {arguments.out}")
     for fit in made:
         if fit.doubts:
             doubts = ", ".join(fit.doubts)
@@ -128,7 +128,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     if len(failed) < len(fits):
         common.print_next("index", arguments.out, "-o", arguments.out / "atlas")
     if failed:
-        raise OgPointcloudError(f"{len(failed)} of {len(fits)} captures failed: mend them, then the same command again")
+        raise OgPointcloudError(f"{len(failed)} of {len(fits)} captures failed: fix them, then repeat the same command")
 
 
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:
@@ -141,6 +141,6 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
     if arguments.mode != "paper":
         raise OgPointcloudError(
             f"--schedule-share is {arguments.schedule_share:g} with --mode {arguments.mode}, which has no schedule; "
-            "expected --mode paper: leave the option out, or take that mode"
+            "expected --mode paper: leave the option out, or use that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))

@@ -17,7 +17,7 @@ def add(parser: Parser) -> None:
     formats = "depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica"
     add_option(parser, "capture", "CAPTURE", f"folder with poses and depth images: {formats}", type=Path)
     add_output(parser, "-o", "--output", endings=(".ply",), help="the cloud to write (default: CAPTURE/points.ply)")
-    unit = "lengths of the poses' world in a stored step, e.g. 0.001 (default: what the data set or the type says)"
+    unit = "world units per stored depth step, e.g. 0.001 (default: as the data set or image type implies)"
     add_option(parser, "--depth-unit", "X", unit, type=float)
 
 
@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> None:
     if unit is not None and not 0 < unit < float("inf"):
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
     if arguments.output is None and output.exists():
-        raise OgPointcloudError(f"'{output}' is there already, and stays; to fuse anew, name another file (-o)")
+        raise OgPointcloudError(f"'{output}' already exists and is kept; to fuse again, name another file (-o)")
     check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
     from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(
         f"{fused.frames} depth images in {time.perf_counter() - start:.1f} s: {len(fused.points):,} points, voxels of "
         f"{fused.survey.voxel:.3g}, noise {fused.survey.noise:.2g} at depth {fused.survey.depth:.3g}; "
-        f"{fused.refused:,} voxels left out that other views looked through"
+        f"{fused.refused:,} voxels left out because other views saw through them"
     )
     print(f"wrote {output}")
     if arguments.output is None:

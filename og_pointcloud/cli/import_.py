@@ -1,4 +1,4 @@
-"""Turn what an OpenGaussian run wrote into one .ogpc file, or a scanner's E57 file into a capture folder.
+"""Turn the result of an OpenGaussian run into one .ogpc file, or a scanner's E57 file into a capture folder.
 
 og-pointcloud import output/ramen -o ramen.ogpc
 og-pointcloud import house.e57 -o house
@@ -17,19 +17,19 @@ from og_pointcloud.journal import Journal
 
 
 def add(parser: Parser) -> None:
-    add_option(parser, "result", "RESULT", "folder of the run, its point_cloud.ply; or .e57", type=Path)
-    output = "the file to write; of an .e57 the folder"
+    add_option(parser, "result", "RESULT", "folder of the run, or its point_cloud.ply, or a .e57 file", type=Path)
+    output = "the file to write; for a .e57 file, the folder"
     common.add_output(parser, "-o", "--output", endings=(".ogpc", ""), required=True, help=output)
     features = "features of the leaves (default: RESULT/cluster_lang.npz)"
     add_option(parser, "--cluster-lang", "F.npz", features, type=Path)
-    add_option(parser, "--feature-space", "NAME", "their encoder (default: LangSplat's, if 512 wide)")
+    add_option(parser, "--feature-space", "NAME", "their encoder (default: LangSplat's, if they have 512 dimensions)")
     common.add_shared(parser, "--text-features")
 
 
 def run(arguments: argparse.Namespace) -> None:
     if arguments.result.suffix.lower() == ".e57":
         if arguments.output.suffix == ".ogpc":
-            raise OgPointcloudError(f"-o is {arguments.output}; expected the name of a folder: what an .e57 becomes")
+            raise OgPointcloudError(f"-o is {arguments.output}; expected a folder name: a .e57 file becomes a folder")
         unpack(arguments.result, arguments.output)
         return
     if arguments.output.suffix != ".ogpc":
@@ -53,7 +53,7 @@ def unpack(file: Path, folder: Path) -> None:
     from og_pointcloud.formats.e57 import unpack_e57
 
     if folder.exists():
-        raise OgPointcloudError(f"{folder} is there already; expected a new folder: name another (-o)")
+        raise OgPointcloudError(f"{folder} already exists; expected a new folder: name another (-o)")
     with replacing_folder(folder) as made:
         made.mkdir()
         images, unused = unpack_e57(file, made)

@@ -1,4 +1,4 @@
-"""Bring an index of many scenes up to date: all .ogpc files in a folder, for `find`.
+"""Make or update an index of all .ogpc files in a folder, for `find`.
 
 og-pointcloud index scans -o atlas
 """
@@ -15,8 +15,8 @@ from og_pointcloud.errors import OgPointcloudError, counted, printable
 
 
 def add(parser: Parser) -> None:
-    add_option(parser, "folder", "DIR", "folder with .ogpc files, also in folders below it", type=Path)
-    index = "the index, one file; where it is there, only what changed is read"
+    add_option(parser, "folder", "DIR", "folder with .ogpc files, also in its subfolders", type=Path)
+    index = "the index file; if it exists, only changed scenes are read"
     parser.add_argument("-o", "--output", type=replaceable, required=True, metavar="ATLAS", help=index)
     add_option(parser, "--lance", "URI", "also write it for LanceDB, to a folder or an object store (s3://...)")
 

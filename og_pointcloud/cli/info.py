@@ -1,4 +1,4 @@
-"""Say what a .ogpc file holds and how it was made.
+"""Show what a .ogpc file contains and how it was made.
 
 og-pointcloud info kitchen.ogpc
 """

@@ -1,4 +1,4 @@
-"""List the instances with their places, boxes, evidence and best words.
+"""List the instances with their positions, boxes, evidence and best words.
 
 og-pointcloud instances kitchen.ogpc --up 0,0,1 -o kitchen.csv
 """
@@ -14,7 +14,7 @@ from og_pointcloud.cli.common import Parser
 
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--text-features", "--up", "--json")
-    common.add_option(parser, "--words", "N", "words a row (default: %(default)s)", type=int, default=3)
+    common.add_option(parser, "--words", "N", "words per row (default: %(default)s)", type=int, default=3)
     common.add_output(parser, "-o", "--output", endings=(".json", ".csv"), help="the whole table as .json or .csv")
 
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
         if largest := table.largest(1):
             thing = largest[0].id
             given = ["--id", thing, "-o", arguments.output.with_name(f"instance_{thing}.ply")]
-            common.print_next("edit", "extract", arguments.bundle, *given, hint="the largest alone: ")
+            common.print_next("edit", "extract", arguments.bundle, *given, hint="only the largest: ")
     else:
         given = [*common.as_given(arguments, "--text-features", "--up"), "-o", arguments.bundle.with_suffix(".csv")]
         common.print_next("instances", arguments.bundle, *given, hint="all rows, with oriented boxes: ")

@@ -1,4 +1,4 @@
-"""Make a map of a ROS 2 bag, frame by frame; needs no ROS.
+"""Make a map from a ROS 2 bag, frame by frame; needs no ROS.
 
 og-pointcloud map drive -o room.ogpc
 """
@@ -17,10 +17,10 @@ from og_pointcloud.errors import OgPointcloudError, counted
 
 def add(parser: Parser) -> None:
     option = partial(add_option, parser)
-    option("bag", "BAG", "depth, masks with features, camera_info, tf (docs/maps)", type=Path)
+    option("bag", "BAG", "with depth, masks, their features, camera_info and tf (docs/maps.md)", type=Path)
     add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map to write")
-    parser.add_argument("--resume", action="store_true", help="go on where an interrupted run was")
-    option("--start", "MAP.ogpc", "a map to go on with (default: an empty one)", type=Path)
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted run")
+    option("--start", "MAP.ogpc", "a map to continue (default: an empty one)", type=Path)
     add_shared(parser, "--frame")
     option("--feature-space", "NAME", "encoder of the features (default: %(default)s)", default="unknown")
     option("--work", "DIR", "where the map is kept while it grows (default: OUT.ogpc.map)", type=replaceable)
@@ -35,9 +35,9 @@ def run(arguments: argparse.Namespace) -> None:
 
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.map")
     if work.exists() and not holds_map(work):  # it is removed at the end
-        raise OgPointcloudError(f"--work is '{work}', which holds other files than a map; expected a new folder's name")
+        raise OgPointcloudError(f"--work is '{work}', which has other files than a map; expected a new folder name")
     if work.exists() and not arguments.resume:
-        raise OgPointcloudError(f"'{work}' holds a map that was interrupted: add --resume, or remove it")
+        raise OgPointcloudError(f"'{work}' contains an interrupted map: add --resume, or remove it")
     frames = BagFrames(arguments.bag, arguments.frame)
     mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
     refused, taken = {}, 0

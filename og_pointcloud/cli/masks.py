@@ -19,19 +19,19 @@ def add(parser: Parser) -> None:
     option = partial(add_option, parser)
     proposers = "opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, python:MODULE:NAME (your own), or a folder"
     option("--proposer", "P", f"{proposers} of id PNGs or COCO .json files", default="opencv")
-    encoders = "demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone"
+    encoders = "demo (default; knows only the demo room), a model's folder, OWNER/MODEL, or none: only masks"
     option("--encoder", "E", encoders, default="demo")
-    ways = "crops: several runs of the encoder a mask (default); dense: one run an image, faster and coarser"
+    ways = "crops: several encoder runs per mask (default); dense: one run per image, faster and coarser"
     option("--features", None, ways, default="crops", choices=("crops", "dense"))
-    option("--words", "WORD", "mask these alone; needs SAM 3", nargs="+", default=())
-    follow = "follow things from image to image: SAM 3's words; or a folder's ids mean the same in all its PNGs"
+    option("--words", "WORD", "mask only these; needs SAM 3", nargs="+", default=())
+    follow = "follow objects from image to image: by SAM 3's words, or by ids that are the same in all PNGs of a folder"
     parser.add_argument("--tracks", action="store_true", help=follow)
-    level = "how much is one mask (default: %(default)s)"
+    level = "how much one mask covers (default: %(default)s)"
     option("--level", None, level, default="medium", choices=("small", "medium", "large"))
     option("--every", "N", "use every N-th image; needs -o (default: all)", type=int, default=1)
     option("--longest-side", "PX", "larger images are shrunk to this (default: %(default)s)", type=int, default=1024)
-    parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
+    parser.add_argument("--overwrite", action="store_true", help="replace masks from elsewhere, or make all again")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a separate capture folder (default: CAPTURE)")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     warn_of_poses(arguments.capture)
     if arguments.encoder == "demo":
         warnings.warn(
-            "the demo encoder knows the demo room's furniture alone: words mean little on other photographs; take "
+            "the demo encoder knows only the demo room's furniture: words mean little for other photographs; use "
             "a model's folder, --encoder FOLDER ('hf cache ls' lists them), or none",
             stacklevel=1,
         )
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     if made.left_out:
         print(f"left out: {len(made.left_out)} of {made.images + len(made.left_out)} images: {some_of(made.left_out)}")
     if made.done_before == made.images:
-        print(f"all {made.images} images have these masks already: nothing to do (--overwrite makes them again)")
+        print(f"all {made.images} images already have these masks: nothing to do (--overwrite makes them again)")
     print(
         f"{counted(made.masks, 'mask')} in {counted(made.images, 'image')} ({made.seconds:.1f} s, {made.done_before} "
         "done before), "

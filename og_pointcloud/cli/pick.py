@@ -1,4 +1,4 @@
-"""Select the instance at a pixel of a view, or at a place; render its mask.
+"""Select the instance at a pixel of a view, or at a position; render its mask.
 
 og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 -o mask.png
 """
@@ -19,9 +19,9 @@ from og_pointcloud.errors import OgPointcloudError, coordinate, did_you_mean
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--text-features", "--json")
     click = parser.add_mutually_exclusive_group(required=True)
-    common.add_option(click, "--xyz", "X,Y,Z", "a place in world coordinates")
+    common.add_option(click, "--xyz", "X,Y,Z", "a position in world coordinates")
     common.add_option(click, "--pixel", "U,V", "a pixel of the view, column and row")
-    common.add_option(parser, "--capture", "CAPTURE", "folder that the view is in", type=Path)
+    common.add_option(parser, "--capture", "CAPTURE", "capture folder of the view", type=Path)
     common.add_option(parser, "--view", "NAME", "file stem of the view's image")
     common.add_output(parser, "-o", "--output", endings=(".png",), help="the instance's mask in the view")
 
@@ -35,9 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
     if not uses_view and (arguments.capture or arguments.view):
         given = "--capture" if arguments.capture else "--view"
-        raise OgPointcloudError(
-            f"{given} is given with --xyz alone, which needs no camera; expected -o MASK.png with it"
-        )
+        raise OgPointcloudError(f"{given} is given, but --xyz alone needs no camera; expected -o MASK.png as well")
     scene = og.load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
     # A click is only as good as the camera's pose, which is checked against the fitted cloud.

@@ -13,8 +13,8 @@ from og_pointcloud.cli.common import Parser, add_option, check_at_least, print_n
 
 
 def add(parser: Parser) -> None:
-    add_option(parser, "photographs", "FOLDER", "with the photographs, or with an images/", type=Path)
-    folder = "the folder to make (default: in FOLDER itself)"
+    add_option(parser, "photographs", "FOLDER", "folder of photographs, or one with an images/ folder", type=Path)
+    folder = "folder to create (default: FOLDER itself)"
     parser.add_argument("-o", "--output", type=Path, metavar="CAPTURE", help=folder)
     size = "larger images are shrunk to this (default: %(default)s)"
     add_option(parser, "--longest-side", "PX", size, type=int, default=1600)
@@ -34,10 +34,10 @@ def run(arguments: argparse.Namespace) -> None:
     features, matches, mapping = poses.seconds
     if poses.left_out:
         count = len(poses.left_out)
-        print(f"warning: {count} photographs found no place: {some_of(poses.left_out)}", file=sys.stderr)
+        print(f"warning: {count} photographs could not be placed: {some_of(poses.left_out)}", file=sys.stderr)
     print(
         f"{poses.registered} of {poses.of} photographs have poses, {poses.points:,} points, mean error "
         f"{poses.error_px:.2f} px (features {features:.0f} s, matches {matches:.0f} s, mapping {mapping:.0f} s)"
     )
-    print(f"wrote {poses.capture / 'sparse'}; its scale is free")
+    print(f"wrote {poses.capture / 'sparse'}; its scale is arbitrary")
     print_next("masks", poses.capture)

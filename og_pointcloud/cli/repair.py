@@ -1,4 +1,4 @@
-"""Put a capture's mistakes right on reading: axes, direction, scale, intrinsics, masks. Its files stay as they are.
+"""Correct a capture's mistakes on reading: axes, direction, scale, intrinsics, masks. Its files are not changed.
 
 og-pointcloud repair kitchen axes=flipped
 """
@@ -18,9 +18,9 @@ def add(parser: Parser) -> None:
 
     parser.epilog = f"{parser.epilog}\n\n{''.join((repairs.__doc__ or '').partition('  axes=')[1:])}"
     add_shared(parser, "capture")
-    order = "applied in this order, behind those that the capture has; none: find them, by checking the capture"
+    order = "repairs, applied in this order after those that the capture has; none: find them by checking the capture"
     add_option(parser, "repairs", "NAME=VALUE", order, nargs="*")
-    parser.add_argument("--only", action="store_true", help="in place of those that the capture has")
+    parser.add_argument("--only", action="store_true", help="replace the repairs that the capture has")
     parser.add_argument("--undo", action="store_true", help="remove all repairs of the capture")
 
 
@@ -34,9 +34,9 @@ def run(arguments: argparse.Namespace) -> None:
     file = capture / REPAIRS_NAME
     if arguments.undo:
         if arguments.repairs:
-            raise OgPointcloudError("--undo takes no repairs: leave them out, or --undo")
+            raise OgPointcloudError("--undo takes no repairs: leave out one or the other")
         file.unlink(missing_ok=True)
-        print(f"{capture} is read as its files are")
+        print(f"{capture} has no repairs: its files are read as they are")
         return
     stated = [] if arguments.only else [str(repair) for repair in read_repairs(capture)]
     new = [str(Repair.parse(text)) for text in arguments.repairs]
@@ -46,11 +46,11 @@ def run(arguments: argparse.Namespace) -> None:
         if not new:
             print_checks([check.as_dict() for check in checks], capture)
             doubts = any(check.verdict == "doubt" for check in checks)
-            print("no repair is known that would help" if doubts else "nothing was found that needs a repair")
+            print("no known repair would help" if doubts else "nothing was found that needs a repair")
             return
     # Read with the repairs before writing them: repairs that the capture cannot be read with are refused here.
     checks = check_capture(read_capture(capture, repairs=[*stated, *new]))
     write_json(file, {"repairs": [*stated, *new]})
     print_checks([check.as_dict() for check in checks], capture)
-    print(f"wrote {file} ({' '.join([*stated, *new])}): every command reads {capture} so; --undo takes it back")
+    print(f"wrote {file} ({' '.join([*stated, *new])}): every command reads {capture} this way; --undo reverts it")
     print_next("fit", capture, "-o", f"{capture.resolve().name}.ogpc")

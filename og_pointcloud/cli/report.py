@@ -1,4 +1,4 @@
-"""Every setting that trades error for time, tried: one table, one chart.
+"""Try every setting that trades error for time: one table, one chart.
 
 og-pointcloud report kitchen shelf --quick -o report
 """
@@ -16,9 +16,9 @@ from og_pointcloud.errors import OgPointcloudError
 
 def add(parser: Parser) -> None:
     option = partial(add_option, parser)
-    option("captures", "CAPTURE", "folders; without gt.npz the error is 1 - reliability", type=Path, nargs="+")
+    option("captures", "CAPTURE", "capture folders; without gt.npz the error is 1 - reliability", type=Path, nargs="+")
     few = parser.add_mutually_exclusive_group()
-    add_option(few, "--knob", "NAME", "only this setting (may be given several times)", action="append")
+    add_option(few, "--knob", "NAME", "only this setting; repeatable", action="append")
     few.add_argument("--quick", action="store_true", help="only the settings that matter most")
     folder = "folder for report.md, .csv and .png (default: %(default)s)"
     parser.add_argument("-o", "--output", type=Path, default=Path("out/report"), metavar="DIR", help=folder)

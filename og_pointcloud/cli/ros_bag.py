@@ -22,10 +22,10 @@ SHOWN_REASONS = 3
 
 def add(parser: Parser) -> None:
     add_option(parser, "bag", "IN", "a bag's folder, or one .db3 or .mcap file", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the folder to make")
-    add_option(parser, "--scene", "S.ogpc", "what `fit` wrote", type=Path, required=True)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder to create")
+    add_option(parser, "--scene", "S.ogpc", "file that `fit` wrote", type=Path, required=True)
     add_shared(parser, "--labels", "--text-features", "--frame")
-    add_option(parser, "--topic", "T", "clouds to label, repeatable (default: every PointCloud2)", action="append")
+    add_option(parser, "--topic", "T", "clouds to label; repeatable (default: every PointCloud2)", action="append")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -47,9 +47,9 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
     pace = max(report.seconds, 1e-9)  # of the clouds alone, without reading and writing the bag
     print(f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s")
     print(
-        f"clouds alone {pace:.1f} s: {report.clouds / pace:.1f} clouds and {report.points / pace:,.0f} points a second"
+        f"clouds only: {pace:.1f} s, {report.clouds / pace:.1f} clouds, {report.points / pace:,.0f} points per second"
     )
     print(f"wrote {output}: {', '.join(report.topics.values())}")
     shown = next(iter(report.topics.values()))
     play = shlex.join(["ros2", "bag", "play", str(output)])
-    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, colored by rgb")
+    print(f"next: {play}, and in RViz show {shown} as PointCloud2, colored by rgb")

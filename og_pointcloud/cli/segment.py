@@ -22,10 +22,10 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
-    common.add_option(parser, "--points", "CLOUD", "points to label (default: those fitted)", type=Path)
-    pose = "where CLOUD stands in the scene: a text file of 4 x 4 numbers, its coordinates to the scene's"
+    common.add_option(parser, "--points", "CLOUD", "points to label (default: the fitted ones)", type=Path)
+    pose = "pose of CLOUD in the scene: a text file of 4 x 4 numbers, from its coordinates to the scene's"
     common.add_option(parser, "--pose", "POSE.txt", pose, type=Path)
-    files = "labels as .npz, or a colored .ply, .las, .laz or .glb; of splats .glb or .spz"
+    files = "labels as .npz, or a colored .ply, .las, .laz or .glb; for splats .glb or .spz"
     common.add_output(parser, "-o", "--output", endings=SAVED_AS, metavar="OUT", help=files)
 
 
@@ -86,7 +86,7 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     common.print_shares(report["counts"], report["unknown"], report["unknown_because"])
     absent = [name for name, count in report["counts"].items() if not count]
     if absent:
-        print(f"no point: {common.some_of(absent)}")
+        print(f"no points: {common.some_of(absent)}")
     if not report["calibrated"]:
         print(
             "not calibrated: every instance gets its best label, however badly it fits. "

@@ -1,4 +1,4 @@
-"""Rank the instances by a word, and say which it fits.
+"""Rank the instances by a word, and mark those that it fits.
 
 og-pointcloud select kitchen.ogpc "red mug"
 """
@@ -16,7 +16,7 @@ from og_pointcloud.errors import counted
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--text-features", "--json")
     common.add_option(parser, "text", "WORD", "a word or phrase")
-    common.add_option(parser, "--against", "A,B,C", "words that compete with it (default: all that are known)")
+    common.add_option(parser, "--against", "A,B,C", "words that compete with it (default: all known words)")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     print(selection)
     if selection.unknown:
-        print(f"no feature that a word could be compared with: {counted(selection.unknown, 'instance')}")
+        print(f"no feature to compare with words: {counted(selection.unknown, 'instance')}")
     if not selection.calibrated:
         print(f"not calibrated: scores are cosines. {common.calibration_hint(arguments.bundle)}")
     if selection.fitting:

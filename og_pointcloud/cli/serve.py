@@ -1,4 +1,4 @@
-"""Serve a live page of scenes: type any word, click for what a thing is. On this machine alone unless --host says more.
+"""Serve a live page of scenes: type any word, or click an object to identify it. Local unless --host is given.
 
 og-pointcloud serve kitchen.ogpc office.ogpc
 """
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     option = partial(add_option, parser)
-    option("bundles", "S.ogpc", "what `fit` wrote; several to choose", type=Path, nargs="+")
+    option("bundles", "S.ogpc", "file that `fit` wrote; several to choose from", type=Path, nargs="+")
     add_shared(parser, "--labels", "--text-features", "--cloud", "--up")
     option("--before", "A.ogpc", "an earlier visit: show what is gone, new and moved since", type=Path)
     option("--host", "H", "address to listen on; 0.0.0.0 lets others in (default: %(default)s)", default="127.0.0.1")
-    option("--port", "N", "or the next one that is free (default: %(default)s)", type=int, default=8080)
+    option("--port", "N", "port, or the next free one (default: %(default)s)", type=int, default=8080)
 
 
 def run(arguments: argparse.Namespace) -> None:
     alone = "--cloud" if arguments.cloud else "--before" if arguments.before else None
     if alone and len(arguments.bundles) > 1:
-        raise OgPointcloudError(f"{alone} is for one scene, but {len(arguments.bundles)} are given; serve it alone")
+        raise OgPointcloudError(f"{alone} is for one scene, but {len(arguments.bundles)} are given; expected only one")
     if arguments.cloud and arguments.before:
-        raise OgPointcloudError("--cloud and --before are both given; expected one: two visits are shown as they are")
+        raise OgPointcloudError("--cloud and --before are both given; expected one: --before shows visits as fitted")
     from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.formats.points import read_points
@@ -50,11 +50,11 @@ def run(arguments: argparse.Namespace) -> None:
         scenes = {title: LiveScene(load(path), shown, *words) for title, path in bundles}
     page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, up))
     try:
-        print(f"{page.url}  (Ctrl-C ends it)", flush=True)
+        print(f"{page.url}  (Ctrl-C stops it)", flush=True)
         if page.is_open:
-            print(f"anyone who reaches {arguments.host} can see and ask these scenes: there is no password", flush=True)
+            print(f"anyone who reaches {arguments.host} can see and query these scenes: it has no password", flush=True)
         else:
-            print("for this machine alone; --host 0.0.0.0 lets others in, without a password", flush=True)
+            print("for this machine only; --host 0.0.0.0 lets others in, without a password", flush=True)
         page.wait()
     except KeyboardInterrupt:  # interrupted before the page waited
         page.stop()

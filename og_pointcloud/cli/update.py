@@ -1,4 +1,4 @@
-"""Fold a later capture of a place, or of a part of it, into its map.
+"""Update the map of a place with a later capture of it, or of a part of it.
 
 og-pointcloud update room.ogpc friday -o room_friday.ogpc --json changes.json
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    add_option(parser, "map", "MAP.ogpc", "the map so far: of `fit`, `map` or `update`", type=Path)
+    add_option(parser, "map", "MAP.ogpc", "the map so far, from `fit`, `map` or `update`", type=Path)
     add_shared(parser, "capture", "--gaussians")
     add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map after this visit")
     add_output(parser, "--json", endings=(".json",), help="also write what is gone, new, moved and unseen")

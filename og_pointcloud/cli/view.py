@@ -1,4 +1,4 @@
-"""Look at a scene labelled by words: a page that any browser opens, without a network.
+"""Write a page of a scene labelled by words, which any browser opens without a network.
 
 og-pointcloud view kitchen.ogpc --labels chair,table --html kitchen.html
 """
@@ -17,10 +17,10 @@ from og_pointcloud.journal import Journal
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--cloud", "--up")
     common.add_output(parser, "--html", endings=(".html", ".htm"), help="the page to write (default: S.html)")
-    parser.add_argument("--boxes", action="store_true", help="boxes around what has a label")
+    parser.add_argument("--boxes", action="store_true", help="draw boxes around labelled instances")
     cut = "hide this share of the height, from the top (default: 0)"
     common.add_option(parser, "--cut", "SHARE", cut, type=float, default=0.0)
-    parser.add_argument("--instances", action="store_true", help="colors by instance")
+    parser.add_argument("--instances", action="store_true", help="color by instance")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     rgb = scene.cloud.rgb if other is None else other.rgb
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
-        raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no point to show; expected at least one")
+        raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no points to show; expected at least one")
     height = result.xyz[shown] @ up  # the view is chosen for the points left by --cut, as when the page opens
     shown[shown] = height <= height.max() - arguments.cut * np.ptp(height)
     view = choose_viewpoint(result.xyz[shown], result.labels[shown] >= 0, up)

@@ -1,4 +1,4 @@
-"""Store words in a .ogpc file, so that asking for them needs no encoder.
+"""Store words in a .ogpc file, so that queries for them need no encoder.
 
 og-pointcloud vocabulary add kitchen.ogpc words.txt
 """
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 def add(parser: Parser) -> None:
     add, bank, carry = add_commands(parser, "action", run_add, run_bank, run_carry)
     for action in (add, bank, carry):
-        add_option(action, "bundle", "S.ogpc", "what `fit` wrote", type=replaceable)
-        add_output(action, "-o", "--output", endings=(".ogpc",), help="another file (default: S.ogpc itself)")
+        add_option(action, "bundle", "S.ogpc", "file that `fit` wrote", type=replaceable)
+        add_output(action, "-o", "--output", endings=(".ogpc",), help="file to write (default: S.ogpc itself)")
     sources = add.add_mutually_exclusive_group(), bank.add_mutually_exclusive_group()
-    add_option(add, "words", "words.txt", "one a line", type=Path, nargs="?")
+    add_option(add, "words", "words.txt", "text file, one word per line", type=Path, nargs="?")
     add_option(sources[0], "--text-features", "F.npz", "or names with their vectors", type=Path)
-    add_option(sources[1], "features", "F.npz", "of at least 50 everyday words", type=Path, nargs="?")
+    add_option(sources[1], "features", "F.npz", "vectors of at least 50 everyday words", type=Path, nargs="?")
     for source in sources:
-        add_option(source, "--text-encoder", "DIR", "default: the feature space's, if found", type=Path)
-    add_option(carry, "encoder", "DIR", "what `og-pointcloud export text` wrote", type=Path)
+        add_option(source, "--text-encoder", "DIR", "text encoder (default: the feature space's, if found)", type=Path)
+    add_option(carry, "encoder", "DIR", "folder that `og-pointcloud export text` wrote", type=Path)
 
 
 def run_add(arguments: argparse.Namespace) -> None:
-    """Store the words of a file, one a line, with their text vectors.
+    """Store the words of a file, one per line, with their text vectors.
 
     og-pointcloud vocabulary add kitchen.ogpc words.txt --text-encoder clip-vit-b32
     """
@@ -40,7 +40,7 @@ def run_add(arguments: argparse.Namespace) -> None:
     from og_pointcloud.text.text_features import read_words
 
     if (arguments.words is None) == (arguments.text_features is None):
-        arguments.parser.error("words come from one place: a file with one a line, or --text-features F.npz")
+        arguments.parser.error("expected words from one source: a file with one per line, or --text-features F.npz")
     if arguments.text_features:
         vocabulary, space = og.read_text_features(arguments.text_features)
     else:
@@ -65,7 +65,7 @@ def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
 
 
 def run_bank(arguments: argparse.Namespace) -> None:
-    """Store everyday words that labels are judged by: answers become probabilities.
+    """Store everyday words to judge labels by: scores become probabilities.
 
     og-pointcloud vocabulary bank kitchen.ogpc --text-encoder clip-vit-b32
     """
@@ -80,11 +80,11 @@ def run_bank(arguments: argparse.Namespace) -> None:
         bank, space = encoder.word_bank, encoder.feature_space
     store_bank(arguments.bundle, bank, space, arguments.output)
     path = arguments.output or arguments.bundle
-    print(f"wrote {path}: {len(bank.vectors)} everyday words to judge labels by; its answers are probabilities now")
+    print(f"wrote {path}: {len(bank.vectors)} everyday words to judge labels by; scores are now probabilities")
 
 
 def run_carry(arguments: argparse.Namespace) -> None:
-    """Store a text encoder in the file, which then answers any word anywhere.
+    """Store a text encoder in the file, so that it can be queried for any word.
 
     og-pointcloud vocabulary carry kitchen.ogpc clip-vit-b32 -o kitchen_any_word.ogpc
     """

@@ -88,7 +88,7 @@ def remove(scene: SceneLike, what: What, output: StrPath, **options: Unpack[Edit
     """
     subject = _subject(scene, what, output, **options)
     if subject.chosen.all():
-        raise OgPointcloudError(f"all {len(subject.chosen)} points would be removed; expected some to stay")
+        raise OgPointcloudError(f"all {len(subject.chosen)} points would be removed; expected some to remain")
     return subject.write(output, subject.rows[~subject.chosen], "removed")
 
 
@@ -129,7 +129,7 @@ def insert(
     _check_output(output, [cloud, other])
     base, added = _read(Path(cloud)), _read(Path(other))
     if holds_gaussians(base.elements) != holds_gaussians(added.elements):
-        raise SceneError(f"one of {cloud} and {other} holds Gaussians, the other plain points; expected two of a kind")
+        raise SceneError(f"one of {cloud} and {other} has Gaussians, the other plain points; expected the same kind")
     moved, lost = placed(added.rows, rotation, scale, translation)
     merged, differing = appended(base.rows, moved)
     inserted = np.arange(len(merged)) >= len(base.rows)
@@ -162,7 +162,7 @@ class _Cloud:
         if Path(output).suffix == ".spz":
             notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
             if not holds_gaussians(elements):
-                raise SceneError(f"{output} holds splats alone, the cloud has plain points; expected .ply, or splats")
+                raise SceneError(f"{output} stores only splats, the cloud has plain points; expected .ply, or splats")
             write_spz(output, gaussians_from_ply(elements))
         else:
             write_ply(output, elements, [f"edited by og-pointcloud: {changed} points {verb}"])
@@ -198,16 +198,14 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
     origin = what.scene if isinstance(what, (Pick, Selection)) else what._scene if isinstance(what, Match) else scene
     if not _is_same(origin, scene):
         raise OgPointcloudError(
-            f"the {type(what).__name__} to edit is of {origin!r:.80}, the scene is {scene!r:.80}; expected one of this "
-            "scene: they are of two scenes"
+            f"the {type(what).__name__} to edit is from {origin!r:.80}, but the scene is {scene!r:.80}; expected one "
+            "from this scene"
         )
     # Converted to ids step by step: a text to a selection, a selection to its instances, a match or pick to its id.
     if isinstance(what, str):
         what = select(scene, what, text_features=text_features)
     if isinstance(what, Selection) and not what.fitting:
-        raise OgPointcloudError(
-            f"'{what.query}' fits none of {count} instances better than other words do: give its id"
-        )
+        raise OgPointcloudError(f"'{what.query}' fits none of {count} instances better than other words do: pass an id")
     if isinstance(what, Pick) and not what.found:
         raise OgPointcloudError(f"the click hit {what}; expected an instance to edit: click elsewhere")
     what = what.instances if isinstance(what, Selection) else what
@@ -241,8 +239,8 @@ def _ids_of_points(scene: LabelledScene, xyz: DoubleArray, cloud: StrPath | None
             "cloud that the .ogpc was made from, or another of the same place in the same frame"
         )
     return ids, (
-        f"{cloud} has {len(xyz)} points, the scene {len(scene.cloud)}, or others: each took the instance of the "
-        f"nearest one, and {far} have none within reach",
+        f"{cloud} has {len(xyz)} points, the scene {len(scene.cloud)}, or they differ: each took the instance "
+        f"of the nearest scene point, and {far} have none within reach",
     )
 
 
@@ -262,11 +260,11 @@ def _halo(
 def _check_output(output: StrPath, inputs: Iterable[StrPath]) -> None:
     path = Path(output)
     if path.suffix not in (".ply", ".spz"):
-        raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply, or .spz of splats")
+        raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply, or .spz for splats")
     for source in inputs:
         if path.exists() and Path(source).exists() and path.samefile(source):
             raise OgPointcloudError(
-                f"the output is '{path}', a file that is read; expected another name: originals stay"
+                f"the output is '{path}', which is an input; expected another name: inputs are kept"
             )
 
 
@@ -294,7 +292,7 @@ def _read(path: Path) -> _Cloud:
             rows = gaussian_rows(gaussians_from_ply(elements))
             return _Cloud({"vertex": rows}, (f"{path}: unpacked; harmonics above the constant one are left out",))
         if not np.isfinite(positions(elements["vertex"])).all():
-            raise SceneError("positions hold NaN or infinity; expected finite ones: remove those points first")
+            raise SceneError("positions contain NaN or infinity; expected finite ones: remove those points first")
     return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
 
 
@@ -307,6 +305,6 @@ def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray
     if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise SceneError(
             f"pose has a determinant of {determinant:.4g} and shears or mirrors; expected a rotation times one "
-            "positive scale: Gaussians cannot follow any other"
+            "positive scale: Gaussians cannot follow other poses"
         )
     return rotation, float(scale), matrix[:3, 3]

@@ -184,7 +184,7 @@ class LiveScene:
             own = self.scene.vocabulary.names if self.scene.vocabulary else ()
             examples = ", ".join([*own[:MAX_HINT_WORDS], "..."] if len(own) > MAX_HINT_WORDS else own)
             stored = [f"stored words: {examples}"] if own else []
-            return Answer("", (*stored, "click a thing to learn what it is"))
+            return Answer("", (*stored, "click an object to identify it"))
         try:
             selection = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
@@ -206,7 +206,7 @@ class LiveScene:
             size = " x ".join(f"{length:.3g}" for length in row.oriented_box.size)
             lines.append(f"size {size} · at {', '.join(map(coordinate, row.centroid))}")
         if row.state == NO_FEATURE:
-            note = "no mask gave it a feature: it answers every word with unknown"
+            note = "no mask gave it a feature: it is unknown for every word"
         else:
             note = meaning(self.scene.chooser.bank is not None) if row.words else "the scene stores no words to name it"
         title = self.names[self.label_of[instance]] if self.label_of[instance] >= 0 else "unknown"
@@ -227,12 +227,12 @@ class LiveScene:
         certainty = self.scene.certainty
         if certainty is None or hit.point is None:
             return answer
-        line = f"that its point is part of it: {certainty[hit.point]:.0%} sure"
+        line = f"certainty that the point belongs to it: {certainty[hit.point]:.0%}"
         return Answer(answer.title, (*answer.lines, line), answer.bars, answer.note)
 
     def _match_text(self, match: Match) -> str:
-        rather = f" (rather {match.rival})" if not match.fits and match.rival else ""
-        return f"instance {match.instance}{rather}"
+        better = f" ({match.rival} fits better)" if not match.fits and match.rival else ""
+        return f"instance {match.instance}{better}"
 
 
 def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:

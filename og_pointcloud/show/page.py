@@ -66,7 +66,7 @@ def write_page(
     """
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:
-        raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected points to show")
+        raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected at least one")
     shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MAX_POINTS)).astype(np.int64)]
     left_out = [f"{len(result) - len(shown):,} of {len(result):,} points"] if len(shown) < len(result) else []
     words, word_data = _words(scene)

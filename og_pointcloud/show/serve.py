@@ -58,7 +58,7 @@ def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None
     """
     empty = [title for title, live in scenes.items() if len(live.xyz) == 0]
     if empty or not scenes:
-        raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no point to show; expected at least one")
+        raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no points to show; expected at least one")
     settings = settings or ServeSettings()
     unit_up(settings.up)  # raises if it is no direction
     _check_address(settings.host, settings.port)
@@ -70,12 +70,10 @@ def _check_address(host: str, port: int) -> None:
     try:
         socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
-        cure = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them"
-        raise OgPointcloudError(f"nothing can listen at '{host}' ({error}); {cure}") from None
+        cure = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all addresses"
+        raise OgPointcloudError(f"cannot listen on '{host}' ({error}); {cure}") from None
     if not 0 <= port < PORT_COUNT:
-        raise OgPointcloudError(
-            f"the port is {port}; expected a number from 0, for any that is free, to {PORT_COUNT - 1}"
-        )
+        raise OgPointcloudError(f"the port is {port}; expected a number from 0, for any free port, to {PORT_COUNT - 1}")
 
 
 def show(scene: Any, labels: Any = None, *, text_features: Any = None) -> LivePage:
@@ -141,7 +139,7 @@ class LivePage:
             self._choice = gui.add_dropdown("scene", tuple(self._scenes))
             self._choice.on_update(self._guarded(self._change_scene))
         with gui.add_form(None) as form:
-            self._word = gui.add_text("find", "", hint="stored words at once, any other with Enter")
+            self._word = gui.add_text("find", "", hint="stored words as you type, others with Enter")
         form.on_submit(self._guarded(self._ask))
         self._word.on_update(self._guarded(self._typed))
         self._answer = gui.add_html("")

@@ -73,7 +73,7 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
     rest = _rest(rows)
     _set(columns, _rest_names(rows), rotated_harmonics(rest, rotation))
     too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
-    return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",) if too_high else ()
+    return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not rotated",) if too_high else ()
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -91,9 +91,9 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
         name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
     }
     if lacking := [name for name in first if name not in second]:
-        notes.append(f"{_listed(lacking)} are 0 for the inserted points, which had none")
+        notes.append(f"{_listed(lacking)} are 0 for the inserted points, which lack them")
     if dropped := [name for name in second if name not in first]:
-        notes.append(f"{_listed(dropped)} of the inserted points are left out, which the cloud does not have")
+        notes.append(f"{_listed(dropped)} of the inserted points are left out: the cloud does not have them")
     return join_columns(merged), tuple(notes)
 
 
@@ -153,7 +153,7 @@ def _rest_names(rows: Rows) -> list[str]:
     present = set(rows.dtype.names or ())
     names = list(itertools.takewhile(present.__contains__, map("f_rest_{}".format, itertools.count())))
     if len(names) % 3:
-        raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
+        raise SceneError(f"{len(names)} f_rest properties; expected a multiple of 3, for three channels")
     return names
 
 

@@ -152,7 +152,7 @@ def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> Te
         return encoder
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
-        f"no text encoder of feature space '{feature_space}' is in {MODELS_VARIABLE} ({named or 'not set'}) or "
+        f"no text encoder for feature space '{feature_space}' is in {MODELS_VARIABLE} ({named or 'not set'}) or "
         f"{cache_folder()}; make one from the model's weights: {export_command(feature_space)}"
     )
 
@@ -167,7 +167,7 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     if carried is not None and (encoder := carried()):
         if encoder.feature_space != feature_space:
             raise FeatureSpaceError(
-                f"{encoder.where} is of feature space '{encoder.feature_space}', the scene of '{feature_space}', and "
+                f"{encoder.where} has feature space '{encoder.feature_space}', the scene has '{feature_space}', and "
                 "vectors of two spaces cannot be compared: store the scene's own (og-pointcloud export --help)"
             )
         return encoder
@@ -203,7 +203,7 @@ def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
     wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
     if wrong or not templates:
         raise OgPointcloudError(
-            f"the template {(wrong or [None])[0]!r:.80} has no place for the name; expected {{}} in it, as in 'a photo "
+            f"the template {(wrong or [None])[0]!r:.80} has no slot for the name; expected {{}} in it, as in 'a photo "
             "of a {}.'"
         )
     return templates

@@ -49,7 +49,7 @@ def read_text_features(path: StrPath) -> tuple[Vocabulary, str]:
     if vectors.dtype.kind != "f" or vectors.ndim != 2 or len(vectors) != len(names) or 0 in vectors.shape:
         raise FeatureSpaceError(
             f"{path}: vectors are {vectors.dtype} {vectors.shape}; expected floats of shape ({len(names)}, D), one row "
-            "a name, and at least one"
+            "per name, and at least one"
         )
     try:
         check_names(names.tolist())
@@ -83,7 +83,7 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
         if not np.isfinite(vector).all():
             raise FeatureSpaceError(f"the vector of '{name}' is NaN or infinite; expected finite ones: encode it again")
         if not vector.any():
-            raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
+            raise FeatureSpaceError(f"the vector of '{name}' is zero, which is similar to nothing: encode it again")
         seen.add(name)
     return Vocabulary(tuple(names), vectors)
 
@@ -99,10 +99,10 @@ def read_words(path: StrPath) -> tuple[str, ...]:
             raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_WORDS_BYTES}")
         lines = path.read_bytes().decode("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
-        raise OgPointcloudError(f"{path} cannot be read as words, one a line, in UTF-8 ({error})") from None
+        raise OgPointcloudError(f"{path} cannot be read as words, one per line, in UTF-8 ({error})") from None
     words = tuple(dict.fromkeys(filter(None, (line.strip() for line in lines))))
     if not words:
-        raise OgPointcloudError(f"{path} has no words; expected one a line")
+        raise OgPointcloudError(f"{path} has no words; expected one per line")
     return words
 
 

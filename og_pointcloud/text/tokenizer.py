@@ -76,7 +76,7 @@ def open_tokenizer(data: bytes, context_length: int, vocabulary: int) -> Tokeniz
     tokenizer = tokenizer or OtherTokenizer(data, context_length)
     if tokenizer.highest_id >= vocabulary:
         raise ValueError(
-            f"it gives ids up to {tokenizer.highest_id}, the model has {vocabulary} tokens: they do not belong together"
+            f"it gives ids up to {tokenizer.highest_id}, but the model has {vocabulary} tokens: they do not match"
         )
     return tokenizer
 
@@ -201,7 +201,7 @@ class BytePairs:
 
 def _id(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
-        raise ValueError(f"{value!r:.40} stands where a token id should")
+        raise ValueError(f"{value!r:.40} is in the place of a token id")
     return value
 
 
@@ -237,10 +237,10 @@ def _check_other(description: dict[str, Any]) -> None:
     if model.get("type", "BPE" if "merges" in model else None) not in ("BPE", "Unigram"):
         raise ValueError(f"its model is a {model.get('type')!r:.40}; expected BPE or Unigram")
     if model.get("dropout"):
-        raise ValueError(f"its byte pairs have dropout {model['dropout']!r:.40}: the same text would give other ids")
+        raise ValueError(f"its byte pairs have dropout {model['dropout']!r:.40}: the same text could give other ids")
     for pattern in _patterns([description.get("normalizer"), description.get("pre_tokenizer")]):
         if pattern not in (CLIP_WORDS, CLIP_SPECIALS + CLIP_WORDS) and not LINEAR_PATTERN.fullmatch(pattern):
-            raise ValueError(f"it looks for the pattern {pattern!r:.80}, which some texts may make slow")
+            raise ValueError(f"it uses the pattern {pattern!r:.80}, which may be slow on some texts")
 
     growth = _growth(description.get("normalizer") or {"type": "Strip"})
     if growth > MAX_GROWTH:
@@ -250,7 +250,7 @@ def _check_other(description: dict[str, Any]) -> None:
     longest = max((len(piece) for piece in (*pieces, *(token["content"] for token in added))), default=0)
     if longest > MAX_PIECE_CHARACTERS or len(added) > MAX_ADDED_PIECES:
         raise ValueError(
-            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most "
+            f"it has a piece of {longest} characters and {len(added)} added pieces; expected at most "
             f"{MAX_PIECE_CHARACTERS} and {MAX_ADDED_PIECES}"
         )
 

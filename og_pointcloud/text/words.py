@@ -47,7 +47,7 @@ def resolve_labels(
         if not sources:
             how = "" if find_encoder(feature_space, carried) else f"; {_ways(feature_space)}"
             raise OgPointcloudError(
-                f"no labels are given, and the scene has no words: name some, as --labels chair,table does{how}"
+                f"no labels are given, and the scene has no words: name some, such as --labels chair,table{how}"
             )
         labels = sources[0]
     if isinstance(labels, Vocabulary):
@@ -76,7 +76,7 @@ def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
 def _ways(feature_space: str) -> str:
     return (
         "pass {name: vector}, or text_features=FILE.npz (--text-features) with 'names', 'vectors' and 'feature_space' "
-        "from the scene's encoder; or store them (og-pointcloud vocabulary add); or, for any word at all, make the "
+        "from the scene's encoder; or store them (og-pointcloud vocabulary add); or, for any word, export the "
         f"encoder once: {export_command(feature_space)}"
     )
 
@@ -98,7 +98,7 @@ def words_of(text_features: StrPath | tuple[Vocabulary, str]) -> tuple[Vocabular
         return text_features
     raise OgPointcloudError(
         f"text_features are a {type(text_features).__name__}; expected an .npz file, or what og.read_text_features "
-        "returned for one, (Vocabulary, name of the feature space): give {name: vector} as labels"
+        "returned for one, (Vocabulary, name of the feature space): pass {name: vector} as labels"
     )
 
 
@@ -109,7 +109,7 @@ def _stacked(names: Iterable[str], vectors: Iterable[Any]) -> NDArray[Any]:
         if row.ndim != 1 or row.dtype.kind not in "fiu" or row.shape != (rows[0] if rows else row).shape:
             raise FeatureSpaceError(
                 f"the vector of '{name}' is {row.dtype} {row.shape}; expected numbers of shape "
-                f"{rows[0].shape if rows else '(D,)'}, one width for all labels"
+                f"{rows[0].shape if rows else '(D,)'}, the same for all labels"
             )
         rows.append(row)
     return np.array(rows).reshape(len(rows), -1) if rows else np.zeros((0, 0))

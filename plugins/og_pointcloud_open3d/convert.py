@@ -44,8 +44,8 @@ def read(path: StrPath) -> Any:
         cloud = host.t.io.read_point_cloud(str(path))
     if cloud.is_empty():
         raise SceneError(
-            f"{path}: Open3D reads no point of it; expected a point cloud that it knows (.ply, .pcd, .xyz, .pts): the "
-            "file is damaged, empty, or of another kind than its name says"
+            f"{path}: Open3D reads no points from it; expected a point cloud that it knows (.ply, .pcd, .xyz, .pts): "
+            "the file is damaged, empty, or not of the kind that its name says"
         )
     return cloud
 

@@ -155,13 +155,13 @@ class OgPlotter:
         self._plotter.enable_point_picking(
             self.query,
             **{"left_clicking": True, "show_point": False, "tolerance": 0.01, "font_size": TEXT_SIZE,
-               "show_message": "click a point, or P over it: what is it?", **options},
+               "show_message": "click a point, or press P over it, to identify it", **options},
         )  # fmt: skip
 
     def query(self, point: ArrayLike) -> Pick:
         """Answer a click at a point, (3,) world coordinates, as ``enable_click_query`` does for the mouse."""
         if self._scene is None:
-            raise OgPointcloudError("no scene to ask yet: call plotter.og.enable_click_query(scene) first")
+            raise OgPointcloudError("no scene to query yet: call plotter.og.enable_click_query(scene) first")
         hit = og.pick(self._scene, np.asarray(point, np.float64))
         if hit.found:
             self._highlight(hit)
@@ -260,12 +260,12 @@ def _drawable(mesh: Any) -> Any:
     if not finite.any():
         raise OgPointcloudError(
             f"a {type(mesh).__name__} of {mesh.n_points} points, 0 of them finite, cannot be drawn; expected points: "
-            "was its file read, does the selection hold any?"
+            "check that its file was read, and that the selection is not empty"
         )
     if finite.all():
         return mesh
     warnings.warn(
-        f"{(~finite).sum():,} of {len(finite):,} points hold NaN or infinity: they are not drawn", stacklevel=3
+        f"{(~finite).sum():,} of {len(finite):,} points contain NaN or infinity: they are not drawn", stacklevel=3
     )
     return mesh.extract_points(finite, adjacent_cells=False)
 

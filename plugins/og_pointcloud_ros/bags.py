@@ -111,7 +111,7 @@ def label_bag(
     """
     source, target = Path(source), Path(target)
     if target.exists():
-        raise SceneError(f"'{target}' exists; expected a new name, as bags are never replaced")
+        raise SceneError(f"'{target}' already exists; expected a new name: bags are never replaced")
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
@@ -139,7 +139,7 @@ def label_bag(
                     for new, message in zip(ours[old.topic], labelled[1:], strict=True):
                         bag.write(new, stamp, store.serialize_cdr(message, new.msgtype))
             if not report.clouds:
-                reason = next(iter(report.skipped), "its topics have no message")
+                reason = next(iter(report.skipped), "its topics have no messages")
                 raise SceneError(f"{source}: no cloud can be labelled: {reason}")
     return report
 
@@ -169,15 +169,14 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
     path = Path(source)
     if path.is_file() and path.suffix == ".bag":
         raise SceneError(
-            f"{path} is a bag of ROS 1; expected one of ROS 2: "
-            f"rosbags-convert --src {path} --dst {path.with_suffix('')}"
+            f"{path} is a ROS 1 bag; expected a ROS 2 bag: rosbags-convert --src {path} --dst {path.with_suffix('')}"
         )
     if not path.exists() or (path.is_dir() and not (path / "metadata.yaml").is_file()):
-        raise SceneError(f"{path} is no bag; expected a folder with a metadata.yaml, or a .db3 or .mcap file")
+        raise SceneError(f"{path} is not a bag; expected a folder with a metadata.yaml, or a .db3 or .mcap file")
     if packed := next((file for file in (path, *path.glob("*")) if file.suffix in (".zstd", ".zst")), None):
         raise SceneError(
-            f"{path} is packed as whole files ({packed.name}), whose size nobody knows before they are unpacked; "
-            "expected messages packed one by one, or not at all: 'ros2 bag convert' it"
+            f"{path} is compressed as whole files ({packed.name}), so its unpacked size is unknown; expected messages "
+            "compressed one by one, or not at all: use 'ros2 bag convert'"
         )
     try:
         reader = Reader(path)
@@ -212,10 +211,10 @@ def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
     for topic in wanted:
         if types.get(topic) != CLOUD:
             what = f"carries {types[topic]}" if topic in types else "is not in the bag"
-            raise SceneError(f"topic '{topic}' {what}; expected one of {CLOUD}: {known}")
+            raise SceneError(f"topic '{topic}' {what}; expected a topic of {CLOUD}: {known}")
     taken = [name for topic in wanted for name in (topic + ending for ending in OUTPUTS) if name in types]
     if taken or LABEL_INFO in types:
-        raise SceneError(f"the bag has a topic '{[*taken, LABEL_INFO][0]}' already; expected one without labels")
+        raise SceneError(f"the bag already has a topic '{[*taken, LABEL_INFO][0]}'; expected a bag without labels")
     if not wanted:
         raise SceneError(f"no cloud to label: {known}; it has {', '.join(sorted(types)) or 'nothing at all'}")
     return wanted
@@ -232,7 +231,7 @@ def transforms_of(reader: Reader, store: Any) -> TransformTree:
             damaged[first_line(error)] += 1
     if damaged:
         example = printable(next(iter(damaged)))
-        warnings.warn(f"{damaged.total()} messages of transforms left out: {example}", stacklevel=3)
+        warnings.warn(f"{damaged.total()} transform messages left out: {example}", stacklevel=3)
     return tree
 
 
@@ -241,7 +240,7 @@ def messages_of(reader: Reader, connections: Sequence[Connection] = ()) -> Itera
     try:
         yield from reader.messages(connections)
     except Exception as error:  # of rosbags or of its databases
-        raise SceneError(f"{reader.path} breaks off ({first_line(error)}): record or copy it again") from None
+        raise SceneError(f"{reader.path} cannot be read fully ({first_line(error)}): record or copy it again") from None
 
 
 def decoded(store: Any, data: bytes, kind: str) -> Any:

@@ -43,7 +43,7 @@ def to_detections(
     owners = result.instances[labelled]
     if len(owners) and owners.max() >= len(table):
         raise OgPointcloudError(
-            f"the result has instance {owners.max()}, the table {len(table)}: they are of two scenes"
+            f"the result has instance {owners.max()}, the table only {len(table)}: they are from different scenes"
         )
     # One row of the result for each instance, no matter which: all its points have the same label and score.
     example = np.zeros(len(table), np.int64)
@@ -66,7 +66,7 @@ def to_label_info(
     names: those of the result, at most 65,535.
     """
     if len(names) > UNLABELLED:
-        raise OgPointcloudError(f"{len(names)} names; expected at most {UNLABELLED}, for {UNLABELLED} means unlabelled")
+        raise OgPointcloudError(f"{len(names)} names; expected at most {UNLABELLED}, as {UNLABELLED} means unlabelled")
     class_map = [
         messages("vision_msgs/msg/VisionClass", class_id=number, class_name=name) for number, name in enumerate(names)
     ]

@@ -39,7 +39,7 @@ def image_array(message: Any) -> NDArray[Any]:
     # A line may be longer than its pixels: step includes padding.
     line = message.width * channels * kind.itemsize
     if message.step < line or len(data) < message.step * message.height:
-        raise SceneError(f"image has {len(data)} bytes, {message.step} a line; expected {message.height} of {line}")
+        raise SceneError(f"image: {len(data)} bytes, {message.step} per row; expected {message.height} rows of {line}")
     lines = data[: message.step * message.height].reshape(message.height, message.step)[:, :line]
     pixels = np.ascontiguousarray(lines).view(kind).reshape(message.height, message.width, channels)
     pixels = pixels.astype(kind.newbyteorder("="))
@@ -78,7 +78,7 @@ class FrameAssembler:
             rows = read_fields(message)
             if "feature" not in (rows.dtype.names or ()):
                 raise SceneError(
-                    f"features have fields {rows.dtype.names}; expected a field 'feature' with a row a mask"
+                    f"features have fields {rows.dtype.names}; expected a field 'feature' with one row per mask"
                 )
             # The width comes from the field: an image without masks has 0 rows of it.
             width = rows.dtype["feature"].shape or (1,)
@@ -135,8 +135,8 @@ class FrameAssembler:
 def _camera(info: Any, rectified: bool, world_to_camera: NDArray[np.float64]) -> Camera:
     if not rectified and np.any(np.abs(np.asarray(info.d, np.float64)) > 1e-9):
         raise SceneError(
-            "camera_info has distortion; expected rectified images: give image_rect topics (of a bag, with 'rect' in "
-            "their names; of the node, with rectified:=true)"
+            "camera_info has distortion; expected rectified images: use image_rect topics (in a bag, with 'rect' in "
+            "their names; for the node, with rectified:=true)"
         )
     # K, 3 x 3, is the lens of the raw images, P, 3 x 4, that of the rectified ones (sensor_msgs/CameraInfo).
     k, p = np.reshape(info.k, (3, 3)), np.reshape(info.p, (3, 4))

@@ -79,7 +79,7 @@ class MapNode(PlacedNode):
             except TransformException as error:
                 if not is_old:  # tf is often a little later: retried
                     continue
-                self._warn(f"a frame was dropped, its transform did not come within {self._max_age} s: {error}")
+                self._warn(f"a frame was dropped: its transform did not arrive within {self._max_age} s: {error}")
             except Exception as error:
                 self._warn(f"a frame was dropped: {error_text(error)}")
             self._assembler.forget(stamp)

@@ -127,7 +127,7 @@ class SegmentNode(PlacedNode):
         """Adopt new labels; refuse unusable values, with the reason, before they are set."""
         for parameter in parameters:
             if parameter.name in PARAMETERS and parameter.name != "labels":
-                return SetParametersResult(successful=False, reason=f"{parameter.name} is read at the start only")
+                return SetParametersResult(successful=False, reason=f"{parameter.name} is only read at startup")
         for labels in (parameter.value for parameter in parameters if parameter.name == "labels"):
             try:
                 self._labeller.segmenter = self._segmenter(labels or [])
@@ -156,7 +156,7 @@ class SegmentNode(PlacedNode):
             if time.monotonic() - arrived <= self._max_age:
                 self._waiting = message, arrived
             else:
-                self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
+                self._warn(f"a cloud was dropped: its transform did not arrive within {self._max_age} s: {error}")
         except Exception as error:  # whatever a message holds, the node keeps running
             self._warn(f"a cloud was dropped: {error_text(error)}")
         else:

@@ -40,7 +40,7 @@ def from_pointcloud2(message: Any) -> NDArray[np.float64]:
         values = rows[name] if name in (rows.dtype.names or ()) else None
         if values is None or values.shape != rows.shape:
             fields = ", ".join(rows.dtype.names or ()) or "none"
-            what = "is absent" if values is None else f"holds {values.shape[-1]} values a point"
+            what = "is absent" if values is None else f"has {values.shape[-1]} values per point"
             raise SceneError(f"field '{name}' of a PointCloud2 {what} (its fields: {fields}); expected x, y, z")
         xyz[..., axis] = values
     return xyz.reshape(-1, 3)
@@ -71,9 +71,8 @@ def read_fields(message: Any) -> NDArray[Any]:
     fits = row_step >= width * point_step or height <= 1
     if not fits or data.size not in (needed, height * row_step) or data.size < needed:
         raise SceneError(
-            f"a PointCloud2 of {height} x {width} points of {point_step} bytes, rows of {row_step}, holds {data.size} "
-            f"bytes; expected {max(needed, height * max(row_step, width * point_step))}: it was cut off, or is no such "
-            "message"
+            f"a PointCloud2 of {height} x {width} points of {point_step} bytes, rows of {row_step}, has {data.size} "
+            f"bytes; expected {max(needed, height * max(row_step, width * point_step))}: it was cut off, or is damaged"
         )
     if height * width == 0:
         return np.zeros((height, width), kind)
@@ -103,7 +102,7 @@ def to_pointcloud2(
     """
     xyz = result.xyz if xyz is None else xyz
     if xyz.shape != (len(result), 3):
-        raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
+        raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), one row per label")
     if double is None and xyz.dtype != np.float32:
         finite = np.abs(xyz[np.logical_and.reduce(np.isfinite(xyz), axis=1)])
         double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > MAX_FLOAT32_M
@@ -169,7 +168,7 @@ def _dtype(fields: Any, point_step: int, byte_order: str) -> np.dtype[Any]:
         if offset < 0 or end > point_step:
             raise SceneError(f"field '{name}' of a PointCloud2 spans bytes {offset} to {end} of a point's {point_step}")
         if name in kinds:
-            raise SceneError(f"field '{name}' of a PointCloud2 comes twice; expected every name once")
+            raise SceneError(f"field '{name}' of a PointCloud2 appears twice; expected each name once")
         if name:
             kinds[name] = ((byte_order + code, (count,)) if count > 1 else byte_order + code, offset)
     formats, offsets = [kind for kind, _ in kinds.values()], [offset for _, offset in kinds.values()]
@@ -183,7 +182,7 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
         return np.frombuffer(data, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
         raise SceneError(
-            f"data of a PointCloud2 is a {type(data).__name__} ({error}); expected one run of bytes"
+            f"data of a PointCloud2 is a {type(data).__name__} ({error}); expected a contiguous run of bytes"
         ) from None
 
 

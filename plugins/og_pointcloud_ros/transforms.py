@@ -92,7 +92,7 @@ class TransformTree:
         down, up = self._to_root(source), self._to_root(target)
         if source != target and not set(down) & set(up):
             missing = [repr(frame) for frame in (target, source) if frame not in self.frames]
-            reason = f"{' and '.join(missing)} unknown" if missing else "they hang on no common frame"
+            reason = f"{' and '.join(missing)} unknown" if missing else "they have no common ancestor"
             raise TransformError(
                 f"no transform from '{source}' to '{target}': {reason}; "
                 f"the frames are {', '.join(self.frames) or 'none'}"
@@ -108,9 +108,9 @@ class TransformTree:
         while path[-1] in self._edges:
             parent = self._edges[path[-1]].parent
             if len(path) == MAX_CHAIN_FRAMES:
-                raise TransformError(f"'{frame}' hangs on more than {MAX_CHAIN_FRAMES} frames; expected a robot's tree")
+                raise TransformError(f"'{frame}' has more than {MAX_CHAIN_FRAMES} ancestors; expected a robot's tree")
             if parent in path:
-                raise TransformError(f"frames hang on each other: {' in '.join([*path, parent])}; expected a tree")
+                raise TransformError(f"frames form a loop: {' in '.join([*path, parent])}; expected a tree")
             path.append(parent)
         return path
 
@@ -132,7 +132,7 @@ class TransformTree:
         if not 0 < after < len(edge.stamps):
             first, last, asked = (moment / NANOSECONDS for moment in (edge.stamps[0], edge.stamps[-1], stamp))
             raise TransformError(
-                f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f}, not at {asked:.3f} s"
+                f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f} s, not at {asked:.3f} s"
             )
         before = after - 1  # the fraction of the way between two stamps
         share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])

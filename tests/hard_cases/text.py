@@ -118,7 +118,7 @@ def empty_word_in_a_file() -> object:
         return read_text_features(path)
 
 
-@refuses(FeatureSpaceError, "the vector of 'chair' is zero", "like nothing", "encode it again")
+@refuses(FeatureSpaceError, "the vector of 'chair' is zero", "similar to nothing", "encode it again")
 def vector_of_zero() -> object:
     """A word whose vector is zero."""
     return segment(labelled_cloud(), {"chair": np.zeros(16)})
