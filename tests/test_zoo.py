@@ -136,7 +136,7 @@ def test_a_row_is_what_the_scorers_say(scenes, tmp_path, capsys):
 def test_settings_are_changed_by_path():
     settings = parsed_settings(["membership.sure_share=0.5", "mode=grouping", "geometry.scales=(0.5,)"])
     assert (settings.membership.sure_share, settings.mode, settings.geometry.scales) == (0.5, "grouping", (0.5,))
-    with pytest.raises(OgPointcloudError, match=r"'membership\.sure' is no setting"):
+    with pytest.raises(OgPointcloudError, match=r"'membership\.sure' is not a setting"):
         parsed_settings(["membership.sure=0.5"])
 
 

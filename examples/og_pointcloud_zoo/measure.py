@@ -135,7 +135,9 @@ def parsed_settings(changes: Iterable[str]) -> FitSettings:
         try:
             found = changed(found, path, value)
         except (AttributeError, TypeError):
-            raise OgPointcloudError(f"'{path}' is not a setting; expected a path like membership.sure_share=0.5") from None
+            raise OgPointcloudError(
+                f"'{path}' is not a setting; expected a path like membership.sure_share=0.5"
+            ) from None
     return found
 
 

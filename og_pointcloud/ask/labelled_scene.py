@@ -415,8 +415,8 @@ def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
     error, determinant = rotation_error(matrix[:3, :3])
     if not error <= ROTATION_TOLERANCE or determinant < 0:  # also if the error is NaN
         raise SceneError(
-            f"the rotation of pose differs from a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a rigid "
-            "pose: bring the points into the scene's unit first, and remove mirroring"
+            f"the rotation of pose differs from a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a "
+            "rigid pose: bring the points into the scene's unit first, and remove mirroring"
         )
     with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay so
         return points @ matrix[:3, :3].T + matrix[:3, 3]
