@@ -1,12 +1,13 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test test-all soak lint check bench zoo clean
+.PHONY: help setup demo test test-all mutations soak lint check bench zoo clean
 .DEFAULT_GOAL := help
 # A process a core; tests of one file stay together, since they share what is slow to make.
 PARALLEL := -n auto --dist loadfile
 
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
-	@echo "make test    run the fast tests; make test-all runs all, as CI does"
+	@echo "make test    run the fast tests; make test-all the slow ones too, as CI does"
+	@echo "make mutations  make small faults, one by one: does a test turn red? (ten minutes)"
 	@echo "make soak    ten minutes of frames, as a robot's: is memory flat?"
 	@echo "make lint    ruff and pyright"
 	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
@@ -25,7 +26,10 @@ test: setup
 	@.venv/bin/python -m pytest $(PARALLEL) -m "not slow"
 
 test-all: setup
-	@.venv/bin/python -m pytest $(PARALLEL)
+	@.venv/bin/python -m pytest $(PARALLEL) -m "not mutation"
+
+mutations: setup
+	@.venv/bin/python -m pytest -m mutation tests/test_mutations.py
 
 soak: setup
 	@OG_POINTCLOUD_SOAK_S=600 .venv/bin/python -m pytest -s -q tests/test_trust.py -k test_soak

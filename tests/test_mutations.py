@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from mutations import MUTATIONS, Mutation
 
-pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[1]
 FAILED = 1
 """What pytest exits with where tests have failed, and nothing else went wrong."""
@@ -45,6 +44,8 @@ def run(copy: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
+@pytest.mark.mutation
 def test_the_copy_is_what_is_imported(copy: Path):
     assert str(copy) in run(copy, "-c", "import og_pointcloud; print(og_pointcloud.__file__)").stdout
 
@@ -57,6 +58,8 @@ def test_text_to_change_stands_once(mutation: Mutation):
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name.replace(" ", "-"))
+@pytest.mark.slow
+@pytest.mark.mutation
 @pytest.mark.usefixtures("changed")
 def test_mutation_is_caught(copy: Path, mutation: Mutation):
     tests = [str(ROOT / "tests" / test) for test in mutation.tests]
