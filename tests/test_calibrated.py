@@ -302,7 +302,7 @@ def test_a_bank_that_is_added_calibrates(plain, made, tmp_path, capsys):
     code, stdout, stderr = run(capsys, "segment", bare, "--labels", ",".join(ABSENT[:5]))
     assert code == 0
     assert "none of 3000 points has a label" in stderr
-    assert "no point: absent 0" in stdout
+    assert "no points: absent 0" in stdout
 
 
 # Recorded captures

@@ -268,7 +268,7 @@ def test_broken_annotation_files(tmp_path, text):
 
 def test_a_color_png_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"is a RGB .*expected a gray PNG"):
+    with pytest.raises(SceneError, match=r"8-bit RGB .*expected an 8-bit or 16-bit gray PNG"):
         ExistingMasks(tmp_path).of("a", (5, 5))
 
 

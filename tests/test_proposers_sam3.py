@@ -26,7 +26,7 @@ from og_pointcloud.masking.sam import SamPredictor, prepared  # noqa: E402
 
 SIDE, WIDTH = 56, 128
 WORDS = ("cat", "low lower")
-IMAGES = np.random.default_rng(2).integers(0, 256, (20, 36, 60, 3)).astype(np.uint8)
+IMAGES = np.random.default_rng(2).integers(0, 256, (10, 36, 60, 3)).astype(np.uint8)
 
 
 def tiny_sam3():
@@ -123,7 +123,7 @@ def test_what_the_model_does_not_trust_is_no_mask(folder):
 
 
 def test_tracks_are_those_of_the_whole_session_though_most_of_it_is_forgotten(folder):
-    """Twenty images, of which the tracker looks four back; transformers alone, which keeps all, says the same."""
+    """Ten images, of which the tracker looks four back; transformers alone, which keeps all, says the same."""
     followed = open_proposer(f"sam:{folder}", WORDS, 0)
     model = tiny_sam3()
     session = transformers.Sam3VideoInferenceSession(dtype=torch.float32)
