@@ -160,7 +160,7 @@ def test_weights_that_do_not_fit(model_folder, tmp_path):
     shutil.copytree(model_folder, tmp_path / "model")
     weights = load_file(model_folder / "model.safetensors")
     for change, says in (
-        (lambda state: state.pop("text_projection.weight"), "lacks 1 of the weights of a CLIPModel, such as 'text_projection"),
+        (lambda state: state.pop("text_projection.weight"), "lacks 1 of the weights of a CLIPModel, such as 'text_pro"),
         (lambda state: state["text_projection.weight"].fill_(torch.nan), "NaN|differs from torch by nan"),
         (lambda state: state.update({"text_projection.weight": torch.zeros(3, 3)}), "cannot be read"),
     ):
