@@ -221,9 +221,10 @@ def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
 def _checksum() -> int:
     """Checksum of the code that labels."""
     root, total = Path(og_pointcloud.__file__).parent, 0
-    for path in sorted(path for folder in ("fitting", "rendering", "ask") for path in (root / folder).glob("*.py")):
+    files = [path for folder in ("fitting", "rendering", "ask") for path in (root / folder).rglob("*.py")]
+    for path in sorted([*files, root / "settings.py", root / "kernels.py"]):
         total = zlib.crc32(path.read_bytes(), total)
-    return zlib.crc32((root / "settings.py").read_bytes(), total)
+    return total
 
 
 class _Bench:

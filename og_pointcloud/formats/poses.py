@@ -157,7 +157,9 @@ def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> DoubleArray:
     quaternion, shift = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
     length = math.hypot(*quaternion)
     if not 1e-8 < length < np.inf or not np.isfinite(shift).all():  # also if it is NaN
-        raise SceneError(f"the pose {quaternion} {shift} has no rotation; expected a finite quaternion of length 1")
+        raise SceneError(
+            f"the pose {quaternion} {shift} has no rotation; expected a finite quaternion that is not zero"
+        )
     return rigid(rotation_of_quaternion(quaternion / length), shift)
 
 
