@@ -243,7 +243,7 @@ def test_the_command(scene, tmp_path, capsys):
     command = ["ros-bag", source, "-o", tmp_path / "out", "--scene", scene.path, "--labels", "apple,pear"]
     code, out, _ = run(capsys, *command)
     assert code == 0
-    for text in ("apple", "unknown", "3 clouds", "points per second", "skipped 1 clouds", "next: ros2 bag play"):
+    for text in ("apple", "unknown", "3 clouds", "points per second", "skipped 1 cloud without", "next: ros2 bag play"):
         assert text in out
     before = read(tmp_path / "out")
     assert "exists; expected a new name" in error_of(capsys, *command)

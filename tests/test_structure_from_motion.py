@@ -60,7 +60,7 @@ def test_poses_and_points_of_a_room(photographs, tmp_path, capsys):
     said = capsys.readouterr()
     assert f"{VIEWS} of {VIEWS + 1} photographs have poses" in said.out
     assert "next: og-pointcloud masks" in said.out
-    assert "1 photographs could not be placed: elsewhere.png" in said.err
+    assert "1 photograph could not be placed: elsewhere.png" in said.err
 
     poses = read_poses(tmp_path / "room")
     found = {name: image.camera for name, image in zip(poses.names, poses.images, strict=True)}

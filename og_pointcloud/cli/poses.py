@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, check_at_least, print_next, some_of
+from og_pointcloud.errors import counted
 
 
 def add(parser: Parser) -> None:
@@ -33,8 +34,8 @@ def run(arguments: argparse.Namespace) -> None:
     )  # fmt: skip
     features, matches, mapping = poses.seconds
     if poses.left_out:
-        count = len(poses.left_out)
-        print(f"warning: {count} photographs could not be placed: {some_of(poses.left_out)}", file=sys.stderr)
+        count = counted(len(poses.left_out), "photograph")
+        print(f"warning: {count} could not be placed: {some_of(poses.left_out)}", file=sys.stderr)
     print(
         f"{poses.registered} of {poses.of} photographs have poses, {poses.points:,} points, mean error "
         f"{poses.error_px:.2f} px (features {features:.0f} s, matches {matches:.0f} s, mapping {mapping:.0f} s)"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_option, add_shared, names_in, print_shares
+from og_pointcloud.errors import counted
 
 if TYPE_CHECKING:
     from og_pointcloud_ros.bags import BagReport
@@ -41,11 +42,12 @@ def run(arguments: argparse.Namespace) -> None:
 def print_report(report: BagReport, output: Path, seconds: float) -> None:
     print_shares(report.counts, report.points - report.counts.total(), report.unknown_because)
     if report.skipped:
-        print(f"skipped {report.skipped.total():,} clouds, which have no labels:")
+        print(f"skipped {counted(report.skipped.total(), 'cloud')} without labels:")
         for reason, count in report.skipped.most_common(SHOWN_REASONS):
             print(f"  {count:,} x {reason}")
     pace = max(report.seconds, 1e-9)  # of the clouds alone, without reading and writing the bag
-    print(f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s")
+    done = counted(report.clouds, "cloud"), counted(report.points, "point"), counted(report.detections, "detection")
+    print(f"{', '.join(done)} in {seconds:.1f} s")
     print(
         f"clouds only: {pace:.1f} s, {report.clouds / pace:.1f} clouds, {report.points / pace:,.0f} points per second"
     )
