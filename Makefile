@@ -1,5 +1,5 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test test-all mutations soak lint check bench zoo clean
+.PHONY: help setup demo test test-all test-release soak lint check bench zoo clean
 .DEFAULT_GOAL := help
 # A process a core; tests of one file stay together, since they share what is slow to make.
 PARALLEL := -n auto --dist loadfile
@@ -7,7 +7,7 @@ PARALLEL := -n auto --dist loadfile
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
 	@echo "make test    run the fast tests; make test-all the slow ones too, as CI does"
-	@echo "make mutations  make small faults, one by one: does a test turn red? (ten minutes)"
+	@echo "make test-release  small faults, one by one: does a test turn red? ten times the fuzzing (fifteen minutes)"
 	@echo "make soak    ten minutes of frames, as a robot's: is memory flat?"
 	@echo "make lint    ruff and pyright"
 	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
@@ -26,10 +26,10 @@ test: setup
 	@.venv/bin/python -m pytest $(PARALLEL) -m "not slow"
 
 test-all: setup
-	@.venv/bin/python -m pytest $(PARALLEL) -m "not mutation"
+	@.venv/bin/python -m pytest $(PARALLEL) -m "not release"
 
-mutations: setup
-	@.venv/bin/python -m pytest -m mutation tests/test_mutations.py
+test-release: setup
+	@.venv/bin/python -m pytest $(PARALLEL) -m release
 
 soak: setup
 	@OG_POINTCLOUD_SOAK_S=600 .venv/bin/python -m pytest -s -q tests/test_trust.py -k test_soak
@@ -37,7 +37,7 @@ soak: setup
 lint: setup
 	@.venv/bin/ruff check
 	@.venv/bin/ruff format --check
-	@.venv/bin/pyright --pythonpath .venv/bin/python
+	@.venv/bin/pyright --threads 2 --pythonpath .venv/bin/python
 
 check: setup
 	@.venv/bin/python tests/hard_cases -o out/check

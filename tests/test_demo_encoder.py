@@ -93,6 +93,7 @@ def test_its_vectors_are_of_this_machine_as_of_any(seen):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_its_script_makes_the_same_weights_from_the_same_seed(tmp_path, monkeypatch):
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnxscript")

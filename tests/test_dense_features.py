@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from capture_files import BY_COLOR
 from test_masks_command import make_capture
-from text_models import OUT, PATCH, SIZE, SPACE, write_files, write_model
+from text_models import OUT, PATCH, SIZE, SPACE, write_model
 
-from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.contracts import MaskSettings
-from og_pointcloud.masking.encode import CropEncoder, open_encoder
+from og_pointcloud.masking.encode import open_encoder
 from og_pointcloud.masking.make_masks import make_masks
 
 torch = pytest.importorskip("torch")
@@ -119,59 +114,6 @@ def test_the_order_of_masks_does_not_matter(encoder):
     image = random.integers(0, 256, (64, 64, 3)).astype(np.uint8)
     masks = random.uniform(size=(4, 64, 64)) < 0.2
     np.testing.assert_allclose(encoder.embed(image, masks)[::-1], encoder.embed(image, masks[::-1]), atol=1e-6)
-
-
-@pytest.mark.slow  # torch.onnx.export
-def test_masks_on_the_command_line(folder, exported, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("og_pointcloud.cli.masks.warn_of_poses", lambda _: None)
-    monkeypatch.setattr("og_pointcloud.masking.clip.published_name", lambda _: SPACE)
-    make_capture(tmp_path / "c", 2)
-    command = ["masks", str(tmp_path / "c"), "--proposer", BY_COLOR, "--encoder", str(folder)]
-    found = []
-    for features in ("dense", "crops"):
-        assert main([*command, "--features", features]) == 0, capsys.readouterr().err
-        found.append(np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views]))
-    assert found[0].shape == found[1].shape
-    assert np.abs(found[0] - found[1]).max() > 1e-3, "the second run made other features"
-    command[-1] = str(exported)
-    assert main([*command, "--features", "dense"]) == 0, capsys.readouterr().err
-    light = np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views])
-    np.testing.assert_allclose(light, found[0], atol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def exported(folder):
-    pytest.importorskip("onnxscript")
-    exporter = pytest.importorskip("og_pointcloud_export.encoders")
-    return exporter.export_image_encoder(folder, folder.parent / f"{folder.name}-onnx", feature_space=SPACE)[0]
-
-
-@pytest.mark.slow  # torch.onnx.export
-@pytest.mark.parametrize("shape", [(48, 48), (33, 40), (97, 31)])
-def test_an_exported_encoder_gives_masks_the_same_vectors(encoder, exported, shape):
-    random = np.random.default_rng(0)
-    image = random.integers(0, 256, (*shape, 3)).astype(np.uint8)
-    masks = random.uniform(size=(3, *shape)) < np.array([0.3, 0.05, 1.1])[:, None, None]
-    light = open_encoder(exported, "dense")
-    assert isinstance(light, DenseEncoder)
-    np.testing.assert_allclose(light.embed(image, masks), encoder.embed(image, masks), atol=1e-5)
-    crops = open_encoder(exported)
-    np.testing.assert_allclose(crops.embed(image, masks), CropEncoder(encoder.model).embed(image, masks), atol=1e-5)
-
-
-@pytest.mark.slow  # torch.onnx.export
-def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_path):
-    def changed(patch):
-        manifest = json.loads((exported / "manifest.json").read_text())
-        files = {"image_encoder.onnx": (exported / "image_encoder.onnx").read_bytes()}
-        return write_files(tmp_path / f"p{patch}", {"manifest.json": json.dumps(manifest | patch).encode(), **files})
-
-    with pytest.raises(OgPointcloudError, match=r"whole crops; .*newly exported .og-pointcloud export image"):
-        open_encoder(changed({"patch": None}), "dense")
-    with pytest.raises(OgPointcloudError, match="patch is 0; expected a whole number up to 32"):
-        open_encoder(changed({"patch": 0}), "dense")
-    with pytest.raises(OgPointcloudError, match=r"expected finite float32 \(1, 16, 16, "):
-        open_encoder(changed({"patch": 4}), "dense").embed(np.zeros((64, 64, 3), np.uint8), np.ones((1, 64, 64), bool))
 
 
 def test_a_model_without_patches_is_refused(tmp_path):

@@ -11,9 +11,11 @@ import shutil
 import numpy as np
 import onnx
 import pytest
+from capture_files import BY_COLOR
 from commands import error_of, output_of
 from onnx import numpy_helper
 from onnxruntime.quantization import QuantType, quantize_dynamic
+from test_masks_command import make_capture
 from text_models import (
     CONTEXT,
     END,
@@ -27,13 +29,15 @@ from text_models import (
     image_vectors,
     text_vectors,
     transformers_model,
+    write_files,
     write_model,
 )
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.crops import LANGSPLAT, WITH_CONTEXT
-from og_pointcloud.masking.encode import OnnxModel, open_encoder
+from og_pointcloud.masking.encode import CropEncoder, OnnxModel, open_encoder
 from og_pointcloud.text.encoder import ENCODER, GRAPH, TextEncoder, encoder_for, read_text_encoder
 from og_pointcloud.text.text_features import everyday_words
 
@@ -42,6 +46,7 @@ pytest.importorskip("transformers")
 pytest.importorskip("onnxscript")
 exporter = pytest.importorskip("og_pointcloud_export.encoders")
 clip = pytest.importorskip("og_pointcloud.masking.clip")
+dense = pytest.importorskip("og_pointcloud.masking.dense")
 torch.set_num_threads(1)
 pytestmark = pytest.mark.slow
 
@@ -54,6 +59,24 @@ def no_models_of_this_machine(monkeypatch, tmp_path):
     monkeypatch.setattr("og_pointcloud.text.encoder.cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setattr(exporter, "cache_folder", lambda: tmp_path / "cache")
     logging.getLogger("transformers").setLevel(logging.ERROR)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def each_graph_is_made_once():
+    """torch.onnx.export takes ten seconds, whichever test of the same module and weights asks for it."""
+    make, graphs = exporter._onnx_graph, {}
+
+    def kept(tower, *arguments):
+        digest = hashlib.sha256(f"{type(tower)} {tower.model.config} {arguments[1:]}".encode())
+        for weight in tower.parameters():
+            digest.update(weight.detach().numpy().tobytes())
+        if digest.digest() not in graphs:
+            graphs[digest.digest()] = make(tower, *arguments)
+        return graphs[digest.digest()]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exporter, "_onnx_graph", kept)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +109,7 @@ def test_texts_have_the_vectors_of_transformers(kind, tmp_path):
         assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == entry["sha256"]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["clip", "siglip"])
 def test_images_have_the_vectors_of_transformers(kind, tmp_path):
     expected = image_vectors(transformers_model(kind), PIXELS)
     folder = write_model(tmp_path / "model", kind)
@@ -110,6 +133,63 @@ def test_merges_alone_make_the_same_tokenizer(model_folder, encoder_folder, tmp_
     folder, _ = exporter.export_text_encoder(tmp_path / "model", tmp_path / "out", feature_space=SPACE)
     before, after = read_text_encoder(encoder_folder), read_text_encoder(folder)
     assert [after.tokens(text) for text in TEXTS[:-1]] == [before.tokens(text) for text in TEXTS[:-1]]
+
+
+# Dense features of exported encoders
+
+
+@pytest.fixture(scope="module", params=("clip", "siglip"))
+def folder(request, tmp_path_factory):
+    return write_model(tmp_path_factory.mktemp(request.param), request.param)
+
+
+@pytest.fixture(scope="module")
+def exported(folder):
+    return exporter.export_image_encoder(folder, folder.parent / f"{folder.name}-onnx", feature_space=SPACE)[0]
+
+
+@pytest.mark.parametrize("shape", [(48, 48), (33, 40), (97, 31)])
+def test_an_exported_encoder_gives_masks_the_same_vectors(folder, exported, shape):
+    encoder = dense.DenseEncoder(clip.TransformersModel(folder, SPACE))
+    random = np.random.default_rng(0)
+    image = random.integers(0, 256, (*shape, 3)).astype(np.uint8)
+    masks = random.uniform(size=(3, *shape)) < np.array([0.3, 0.05, 1.1])[:, None, None]
+    light = open_encoder(exported, "dense")
+    assert isinstance(light, dense.DenseEncoder)
+    np.testing.assert_allclose(light.embed(image, masks), encoder.embed(image, masks), atol=1e-5)
+    crops = open_encoder(exported)
+    np.testing.assert_allclose(crops.embed(image, masks), CropEncoder(encoder.model).embed(image, masks), atol=1e-5)
+
+
+def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_path):
+    def changed(patch):
+        manifest = json.loads((exported / "manifest.json").read_text())
+        files = {"image_encoder.onnx": (exported / "image_encoder.onnx").read_bytes()}
+        return write_files(tmp_path / f"p{patch}", {"manifest.json": json.dumps(manifest | patch).encode(), **files})
+
+    with pytest.raises(OgPointcloudError, match=r"whole crops; .*newly exported .og-pointcloud export image"):
+        open_encoder(changed({"patch": None}), "dense")
+    with pytest.raises(OgPointcloudError, match="patch is 0; expected a whole number up to 32"):
+        open_encoder(changed({"patch": 0}), "dense")
+    with pytest.raises(OgPointcloudError, match=r"expected finite float32 \(1, 16, 16, "):
+        open_encoder(changed({"patch": 4}), "dense").embed(np.zeros((64, 64, 3), np.uint8), np.ones((1, 64, 64), bool))
+
+
+def test_masks_on_the_command_line(folder, exported, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("og_pointcloud.cli.masks.warn_of_poses", lambda _: None)
+    monkeypatch.setattr("og_pointcloud.masking.clip.published_name", lambda _: SPACE)
+    make_capture(tmp_path / "c", 2)
+    command = ["masks", str(tmp_path / "c"), "--proposer", BY_COLOR, "--encoder", str(folder)]
+    found = []
+    for features in ("dense", "crops"):
+        assert main([*command, "--features", features]) == 0, capsys.readouterr().err
+        found.append(np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views]))
+    assert found[0].shape == found[1].shape
+    assert np.abs(found[0] - found[1]).max() > 1e-3, "the second run made other features"
+    command[-1] = str(exported)
+    assert main([*command, "--features", "dense"]) == 0, capsys.readouterr().err
+    light = np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views])
+    np.testing.assert_allclose(light, found[0], atol=1e-5)
 
 
 # What cannot be exported

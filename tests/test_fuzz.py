@@ -388,7 +388,7 @@ def fuzzed(examples: int, **arguments: some.SearchStrategy) -> Callable[[Callabl
     return lambda check: rules(given(**arguments)(check))()
 
 
-EXAMPLES = [12, pytest.param(300, marks=pytest.mark.slow)]
+EXAMPLES = [30, pytest.param(300, marks=[pytest.mark.slow, pytest.mark.release])]
 
 
 @pytest.fixture(scope="module")

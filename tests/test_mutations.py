@@ -45,7 +45,7 @@ def run(copy: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.mutation
+@pytest.mark.release
 def test_the_copy_is_what_is_imported(copy: Path):
     assert str(copy) in run(copy, "-c", "import og_pointcloud; print(og_pointcloud.__file__)").stdout
 
@@ -59,7 +59,7 @@ def test_text_to_change_stands_once(mutation: Mutation):
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name.replace(" ", "-"))
 @pytest.mark.slow
-@pytest.mark.mutation
+@pytest.mark.release
 @pytest.mark.usefixtures("changed")
 def test_mutation_is_caught(copy: Path, mutation: Mutation):
     tests = [str(ROOT / "tests" / test) for test in mutation.tests]
