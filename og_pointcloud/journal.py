@@ -20,6 +20,10 @@ class LeftOut(Enum):
 
     # fmt: off
     COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another does, and get its label"
+    DENSE_POINTS = (
+        "points denser than pixels", "{share:.0%} of the points",
+        "those within {pixels:g} pixels share the label of their mean",
+    )
     SHAPES = (
         "shapes of Gaussians", "scale, rotation and opacity of the Gaussians",
         "visibility is tested along the ray through each center",

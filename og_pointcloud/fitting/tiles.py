@@ -63,7 +63,7 @@ from og_pointcloud.rendering.geometry import (
 )
 from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
-from og_pointcloud.rendering.surface import sight_thickness, with_distinct_points
+from og_pointcloud.rendering.surface import sight_thickness, with_needed_points
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
@@ -126,7 +126,7 @@ def fit_tiles(
         )
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
-    scene, row_of_point = with_distinct_points(scene, journal)
+    scene, row_of_point = with_needed_points(scene, journal)
     scene = with_needed_views(scene, settings.geometry.enough_views, journal)
     count, run = len(scene.points), partial(run_tasks, executor, journal)
     most = settings.tile_points or _points_per_tile(count, _memory(count, settings, executor))

@@ -20,6 +20,7 @@ from og_pointcloud.rendering.geometry import (
     neighborhood,
     thinned,
 )
+from og_pointcloud.rendering.pixel_cells import with_points_of_cells
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
@@ -29,8 +30,8 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: with one point per position (in mode paper all Gaussians stay), in Morton order; n points, at the positions
-    at which they are drawn (smoothing.py).
+    scene: with the points that are needed (`with_needed_points`; in mode paper all Gaussians stay), in Morton order; n
+    points, at the positions at which they are drawn (smoothing.py).
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in the same order.
     neighborhood: spacing and neighbors of the n points as measured. gaussians: how the n points are drawn.
@@ -64,7 +65,7 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     is_paper = settings.mode == "paper"
     row_of_point = None
     if not (is_paper and scene.points.are_gaussians):  # overlapping Gaussians look right only together
-        scene, row_of_point = with_distinct_points(scene, journal)
+        scene, row_of_point = with_distinct_points(scene, journal) if is_paper else with_needed_points(scene, journal)
     with journal.stage("spacing"):
         scene, row_of_point = _in_morton_order(scene, row_of_point)
         if not is_paper:  # mode paper draws its own views, one per step
@@ -78,6 +79,16 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         # Only mode paper renders a view more than once.
         stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal) if is_paper else 1
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, not is_paper)
+
+
+def with_needed_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
+    """The scene with one point per position or, where points are denser than pixels, per cell of two pixels; and for
+    each of its points the row that stands for it; None if all stay."""
+    scene, row_of_point = with_distinct_points(scene, journal)
+    scene, cell = with_points_of_cells(scene, journal)
+    if cell is None:
+        return scene, row_of_point
+    return scene, cell if row_of_point is None else cell[row_of_point]
 
 
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
