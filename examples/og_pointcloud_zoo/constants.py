@@ -63,6 +63,8 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.smoothing.NOISE_NEIGHBORS": ("table", ("_smoothed",)),
     "rendering.smoothing.NOISE_BIAS": ("table", ("_smoothed",)),
     "rendering.sightings.RING_SHARE": ("table", ()),
+    "rendering.pixel_cells.CELL_PIXELS": ("table", ()),
+    "rendering.pixel_cells.MAX_KEPT_SHARE": ("table", ()),
 }
 """Constants of modules: whether they change the mask table, and the compiled functions that use them."""
 TABLE = ("geometry", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes")
@@ -92,6 +94,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS",
         "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
         "rendering.sightings.RING_SHARE", "rendering.smoothing.NOISE_NEIGHBORS", "rendering.smoothing.NOISE_BIAS",
+        "rendering.pixel_cells.CELL_PIXELS", "rendering.pixel_cells.MAX_KEPT_SHARE",
     ),
 }  # fmt: skip
 """Where numbers come from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
