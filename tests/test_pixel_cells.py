@@ -15,10 +15,10 @@ from visits import cameras, scene, surface
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering import pixel_cells
-from og_pointcloud.rendering.geometry import sample_of_points
+from og_pointcloud.rendering.geometry import neighborhood, sample_of_points
 from og_pointcloud.rendering.pixel_cells import CELL_PIXELS, MAX_LEVEL, pixel_widths, with_points_of_cells
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, GeometrySettings
 
 DENSE, SPARSE = 0.01, 0.06
 """Spacings; a pixel is about 0.04 wide."""
@@ -146,6 +146,9 @@ def test_a_dense_cloud_is_labelled_cell_by_cell(tile_points: int | None) -> None
     cell = with_points_of_cells(dense, Journal(progress=False))[1]
     assert cell is not None
     assert cell.max() < len(cell) / 5
+    assert cloud.spacing == pytest.approx(
+        np.median(neighborhood(dense.points.xyz, GeometrySettings()).spacing), rel=0.1
+    )
     for rows in partition(cell):
         assert len(set(cloud.instance_ids[list(rows)])) == 1
     assert len(cloud.instances) == BOXES

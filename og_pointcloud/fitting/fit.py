@@ -26,6 +26,7 @@ from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
 from og_pointcloud.rendering.geometry import drawn_spacing, isotropic, thinned
+from og_pointcloud.rendering.pixel_cells import typical_spacing
 from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
@@ -144,8 +145,8 @@ def fit_prepared(
 
 def labelled_cloud(prepared: Prepared, labelling: Labelling, settings: FitSettings, journal: Journal) -> LabelledCloud:
     """The scene's points with the labels of the surface's points."""
-    spacing = float(np.median(prepared.surface.neighborhood.spacing))
-    # Points at the same place were left out of the surface, and get the same label.
+    spacing = typical_spacing(prepared.scene.points.xyz, prepared.surface.neighborhood.spacing)
+    # Points at the same place, or in the same cell, are one point of the surface, and get one label.
     labelling = labelling.of_points(prepared.surface.row_of_point)
     return _cloud_of(prepared.scene, labelling, spacing, settings, journal)
 

@@ -61,6 +61,7 @@ from og_pointcloud.rendering.geometry import (
     position_hash,
     sample_of_points,
 )
+from og_pointcloud.rendering.pixel_cells import typical_spacing
 from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
 from og_pointcloud.rendering.surface import sight_thickness, with_needed_points
@@ -126,6 +127,7 @@ def fit_tiles(
         )
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
+    xyz = scene.points.xyz
     scene, row_of_point = with_needed_points(scene, journal)
     scene = with_needed_views(scene, settings.geometry.enough_views, journal)
     count, run = len(scene.points), partial(run_tasks, executor, journal)
@@ -152,7 +154,7 @@ def fit_tiles(
         decided = run(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
         labelling = _instances(cloud, shown, grouped.looks, decided, settings)
-    return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
+    return labelling.of_points(row_of_point), typical_spacing(xyz, cloud.spacing)
 
 
 def _memory(points: int, settings: FitSettings, executor: Executor | None) -> int:

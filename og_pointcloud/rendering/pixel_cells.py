@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.geometry import nearest_in, sample_of_points
+from og_pointcloud.rendering.geometry import distinct_positions, nearest_in, sample_of_points
 from og_pointcloud.scene import Points, Scene, View
 
 CELL_PIXELS = 2.0
@@ -24,7 +24,7 @@ CELL_PIXELS = 2.0
 MAX_KEPT_SHARE = 1 / 3
 """Points are merged only where no more than this share of them is left: else many views tell most of them apart."""
 SAMPLED_POINTS = 2_000
-"""Points at which the width of a pixel is measured; the others have that of the nearest of these."""
+"""Points at which the width of a pixel is measured (the others have that of the nearest of these), and the spacing."""
 MAX_LEVEL = 8
 """Cells are at most this many times halved or doubled in width."""
 INDEX_BITS = 19
@@ -62,6 +62,16 @@ def with_points_of_cells(scene: Scene, journal: Journal) -> tuple[Scene, NDArray
         rgb = np.stack([np.rint(np.bincount(cell, of) / held) for of in rgb.T], axis=1).astype(np.uint8)
     merged = Points(np.stack(xyz, axis=1).astype(np.float32), points.origin, rgb)
     return replace(scene, points=merged), cell
+
+
+def typical_spacing(xyz: NDArray[np.float32], spacing: NDArray[np.float32]) -> float:
+    """Of a whole cloud (n, 3), from the spacing of the points that stand for it; of a sample of it, where these are
+    cells' points, which lie farther apart."""
+    if len(spacing) > MAX_KEPT_SHARE * len(xyz):
+        return float(np.median(spacing))
+    positions = xyz[distinct_positions(xyz)[0]]
+    nearest = nearest_in(cKDTree(positions), positions[sample_of_points(positions, SAMPLED_POINTS)], 4)[0]
+    return float(np.median(nearest[:, 1:].mean(axis=1)))
 
 
 def pixel_widths(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.float64]:
