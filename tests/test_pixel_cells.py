@@ -146,9 +146,8 @@ def test_a_dense_cloud_is_labelled_cell_by_cell(tile_points: int | None) -> None
     cell = with_points_of_cells(dense, Journal(progress=False))[1]
     assert cell is not None
     assert cell.max() < len(cell) / 5
-    assert cloud.spacing == pytest.approx(
-        np.median(neighborhood(dense.points.xyz, GeometrySettings()).spacing), rel=0.1
-    )
+    spacing = np.median(neighborhood(dense.points.xyz, GeometrySettings()).spacing)
+    assert cloud.spacing == pytest.approx(spacing, rel=0.25)  # a cell is twelve times as wide
     for rows in partition(cell):
         assert len(set(cloud.instance_ids[list(rows)])) == 1
     assert len(cloud.instances) == BOXES
