@@ -125,10 +125,10 @@ def fit_tiles(
             f'mode is "{settings.mode}", which learns from all points at once; expected "grouping" for a fit in tiles: '
             "use that, or thin the cloud until it fits into memory"
         )
-    if settings.tile_points is None:
-        journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
     xyz = scene.points.xyz
     scene, row_of_point = with_needed_points(scene, journal)
+    if settings.tile_points is None and needs_tiles(scene, settings):  # a dense cloud may fit into memory by now
+        journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
     scene = with_needed_views(scene, settings.geometry.enough_views, journal)
     count, run = len(scene.points), partial(run_tasks, executor, journal)
     most = settings.tile_points or _points_per_tile(count, _memory(count, settings, executor))
