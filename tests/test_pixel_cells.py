@@ -52,8 +52,8 @@ def literal_cells(scene: Scene) -> dict[tuple[float, ...], list[int]]:
             if z > 0:
                 u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
                 if 0 <= u < camera.width and 0 <= v < camera.height:
-                    seen.append(math.log(math.sqrt(x * x + y * y + z * z) / math.sqrt(camera.fx * camera.fy)))
-        width.append(math.exp(sum(seen) / len(seen)) if seen else math.nan)
+                    seen.append(math.sqrt(x * x + y * y + z * z) / math.sqrt(camera.fx * camera.fy))
+        width.append(0.75 * min(seen) + 0.25 * max(seen) if seen else math.nan)  # of two views, or one
     known = [k for k, w in enumerate(width) if not math.isnan(w)]
     typical, middle = float(np.median([width[k] for k in known])), np.median(scene.points.xyz, axis=0)
     cells = defaultdict(list)
@@ -85,7 +85,7 @@ def test_cells_are_those_of_the_literal_reference(seed: int, monkeypatch: pytest
 def test_pixels_are_as_wide_as_their_angle_makes_them() -> None:
     views = wall(10).views
     (width, nowhere) = pixel_widths(np.array([[0.0, 0, 4], [0, 0, -3]]), views)
-    assert width == pytest.approx(math.sqrt(5 * math.hypot(5, 0.3)) / 50)
+    assert width == pytest.approx((0.75 * 5 + 0.25 * math.hypot(5, 0.3)) / 50)
     assert math.isnan(nowhere)
 
 

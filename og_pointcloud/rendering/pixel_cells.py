@@ -21,10 +21,12 @@ from og_pointcloud.scene import Points, Scene, View
 
 CELL_PIXELS = 2.0
 """Width of a cell, in pixels."""
-MAX_KEPT_SHARE = 1 / 3
+MAX_KEPT_SHARE = 0.4
 """Points are merged only where no more than this share of them is left: else many views tell most of them apart."""
 SAMPLED_POINTS = 2_000
 """Points at which the width of a pixel is measured (the others have that of the nearest of these), and the spacing."""
+NEAREST_SHARE = 0.25
+"""The width of a pixel is its quantile of this order over the views that show a point."""
 MAX_LEVEL = 8
 """Cells are at most this many times halved or doubled in width."""
 INDEX_BITS = 19
@@ -75,16 +77,17 @@ def typical_spacing(xyz: NDArray[np.float32], spacing: NDArray[np.float32]) -> f
 
 
 def pixel_widths(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.float64]:
-    """(n,) how wide a pixel is at each point (n, 3), scene units: the geometric mean over the views whose images it
-    lies in, hidden or not; NaN where there are none."""
-    logarithms, seen = np.zeros(len(xyz)), np.zeros(len(xyz))
-    for camera in (view.camera for view in views):
+    """(n,) how wide a pixel is at each point (n, 3), scene units, in the views whose images it lies in: in the nearest
+    quarter of them, as farther ones may look at it through walls. NaN where there are none."""
+    widths = np.full((len(views), len(xyz)), np.nan)
+    for width, camera in zip(widths, (view.camera for view in views), strict=True):
         uv, depth = camera.project(xyz)
         shown = camera.shows(uv) & (depth > 0)
-        distance = np.linalg.norm(xyz[shown] - camera.center, axis=1)
-        logarithms[shown] += np.log(distance / np.sqrt(camera.fx * camera.fy))
-        seen[shown] += 1
-    return np.exp(np.divide(logarithms, seen, out=np.full(len(xyz), np.nan), where=seen > 0))
+        width[shown] = np.linalg.norm(xyz[shown] - camera.center, axis=1) / np.sqrt(camera.fx * camera.fy)
+    seen = np.isfinite(widths).any(axis=0)
+    found = np.full(len(xyz), np.nan)
+    found[seen] = np.nanquantile(widths[:, seen], NEAREST_SHARE, axis=0)
+    return found
 
 
 def _levels(xyz: NDArray[np.float32], views: Sequence[View]) -> tuple[NDArray[np.float64], float]:
