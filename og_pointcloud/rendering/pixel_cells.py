@@ -3,7 +3,7 @@
 Images tell nothing apart that is smaller than a pixel. Where points are denser than that, as those of a laser scan
 beside small images, what neighbors decide is decided within less than a pixel: gaps that no view saw stay open, and
 edges stay ragged. So all points of a cell share one state, decided at their mean. A cell is CELL_PIXELS pixels wide at
-the distances from which views see it.
+the distance of the nearest views.
 """
 
 from __future__ import annotations
