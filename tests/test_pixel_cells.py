@@ -16,7 +16,13 @@ from og_pointcloud.fitting.fit import fit
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering import pixel_cells
 from og_pointcloud.rendering.geometry import neighborhood, sample_of_points
-from og_pointcloud.rendering.pixel_cells import CELL_PIXELS, MAX_LEVEL, pixel_widths, with_points_of_cells
+from og_pointcloud.rendering.pixel_cells import (
+    CELL_PIXELS,
+    MAX_LEVEL,
+    pixel_widths,
+    typical_spacing,
+    with_points_of_cells,
+)
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -153,6 +159,15 @@ def test_a_dense_cloud_is_labelled_cell_by_cell(tile_points: int | None) -> None
     assert len(cloud.instances) == BOXES
     assert cloud.instances.points.sum() == (cloud.instance_ids >= 0).sum()
     assert share_right(cloud, np.where(owner < 0, TABLE, owner)) > 0.9
+
+
+def test_the_spacing_of_a_cloud_is_that_of_its_positions() -> None:
+    once = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
+    spacing = neighborhood(once, GeometrySettings()).spacing
+    assert typical_spacing(np.repeat(once, 9, axis=0), spacing) == np.median(spacing)
+    assert typical_spacing(np.repeat(once[:1], 9, axis=0), np.ones(1, np.float32)) == 1
+    assert typical_spacing(once, spacing[:9]) == pytest.approx(np.median(spacing), rel=0.25)
+    assert typical_spacing(np.eye(3, dtype=np.float32), np.ones(1, np.float32)) == pytest.approx(np.sqrt(2))
 
 
 def test_a_sparse_cloud_is_labelled_point_by_point() -> None:

@@ -69,10 +69,11 @@ def with_points_of_cells(scene: Scene, journal: Journal) -> tuple[Scene, NDArray
 def typical_spacing(xyz: NDArray[np.float32], spacing: NDArray[np.float32]) -> float:
     """Of a whole cloud (n, 3), from the spacing of the points that stand for it; of a sample of it, where these are
     cells' points, which lie farther apart."""
-    if len(spacing) > MAX_KEPT_SHARE * len(xyz):
+    positions = xyz if len(spacing) > MAX_KEPT_SHARE * len(xyz) else xyz[distinct_positions(xyz)[0]]
+    if len(spacing) > MAX_KEPT_SHARE * len(positions):
         return float(np.median(spacing))
-    positions = xyz[distinct_positions(xyz)[0]]
-    nearest = nearest_in(cKDTree(positions), positions[sample_of_points(positions, SAMPLED_POINTS)], 4)[0]
+    few = positions[sample_of_points(positions, SAMPLED_POINTS)]
+    nearest = nearest_in(cKDTree(positions), few, min(4, len(positions)))[0]
     return float(np.median(nearest[:, 1:].mean(axis=1)))
 
 
