@@ -56,6 +56,10 @@ MUTATIONS = (
         "min(1.0, NOISE_BIAS * noise / variance) * height", "height", ("test_smoothing.py",),
     ),
     Mutation(
+        "cells of twice the width", "rendering/pixel_cells.py",
+        "CELL_PIXELS * typical", "2 * CELL_PIXELS * typical", ("test_pixel_cells.py",),
+    ),
+    Mutation(
         "layers of one surface hide each other", "rendering/sightings.py",
         "surface[k] = splats[of_tile[k]].surface", "surface[k] = splats[of_tile[k]].depth", ("test_sightings.py",),
     ),
