@@ -65,6 +65,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.sightings.RING_SHARE": ("table", ()),
     "rendering.pixel_cells.CELL_PIXELS": ("table", ()),
     "rendering.pixel_cells.MAX_KEPT_SHARE": ("table", ()),
+    "rendering.pixel_cells.NEAREST_SHARE": ("table", ()),
 }
 """Constants of modules: whether they change the mask table, and the compiled functions that use them."""
 TABLE = ("geometry", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes")
@@ -95,6 +96,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
         "rendering.sightings.RING_SHARE", "rendering.smoothing.NOISE_NEIGHBORS", "rendering.smoothing.NOISE_BIAS",
         "rendering.pixel_cells.CELL_PIXELS", "rendering.pixel_cells.MAX_KEPT_SHARE",
+        "rendering.pixel_cells.NEAREST_SHARE",
     ),
 }  # fmt: skip
 """Where numbers come from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
