@@ -354,6 +354,16 @@ def test_a_scene_is_made_worse_by_as_much_as_asked(scenes):
             assert ((old == whole[0]) == (ids == k)).all()
             assert np.array_equal(view.mask_features[k], before.mask_features[whole[0]])
 
+    for view, before in zip(worse(scene, "eroded", 2).views, scene.views, strict=True):
+        old, around = before.mask_map(), np.pad(before.mask_map(), 1, mode="edge")
+        beside = [around[y : y + old.shape[0], x : x + old.shape[1]] for y, x in ((0, 1), (2, 1), (1, 0), (1, 2))]
+        edges = np.argwhere(np.logical_or.reduce([old != other for other in beside]))
+        away = cKDTree(edges).query(np.argwhere(old >= -9))[0].reshape(old.shape)
+        left, kept = np.where((old >= 0) & (away < 2), -1, old), view.mask_map()
+        assert np.array_equal(kept >= 0, left >= 0)
+        features = np.array([before.mask_features[k] for k in left[left >= 0]])
+        assert np.array_equal(view.mask_features[kept[kept >= 0]], features)
+
 
 def test_a_worse_scene_is_scored_at_the_points_it_had(scenes):
     truth, capture = read_truth(scenes[0]), read_capture(scenes[0])

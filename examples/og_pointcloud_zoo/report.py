@@ -23,6 +23,7 @@ UNITS = {
     "strays": "strays, share of points",
     "poses": "poses off by, pixels",
     "masks": "masks missing, share",
+    "eroded": "masks end early by, pixels",
 }
 SHOWN = 5
 

@@ -6,6 +6,7 @@ noise    every point is off by this many spacings, standard deviation along each
 strays   this many more points, as a share of them, anywhere in the scene's box
 poses    every camera is turned in a random direction, so that its image is off by this many pixels
 masks    this share of the masks is missing
+eroded   every mask ends this many pixels before its object does, as some proposers' masks do
 colors   "noisy": the points' colors with noise; "grey": those without hue; "none": no colors
 
 The same scene and amount always give the same worse scene. It is scored at the points that the scene had before.
@@ -17,7 +18,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from og_pointcloud.errors import OgPointcloudError
@@ -34,6 +37,7 @@ LADDER: Mapping[str, tuple[float, ...]] = {
     "strays": (0.02, 0.1, 0.3),
     "poses": (1, 2, 4, 8),
     "masks": (0.25, 0.5, 0.75),
+    "eroded": (1, 2, 4),
 }
 """The amounts tried of each kind, from little to much."""
 
@@ -91,14 +95,28 @@ def _poses(scene: Scene, pixels: float, rng: np.random.Generator) -> Scene:
 
 def _masks(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
     def without(view: View) -> View:
-        kept = rng.random(view.mask_count) >= share
-        number = np.where(kept, np.cumsum(kept) - 1, -1)
-        ids = view.mask_map()
-        tracks = None if view.mask_tracks is None else view.mask_tracks[kept]
-        fewer = np.where(ids >= 0, np.append(number, -1)[ids], ids).astype(np.int32)
-        return replace(view, masks=fewer, mask_features=view.mask_features[kept], mask_tracks=tracks, cut_from=None)
+        return _with_some(view, view.mask_map(), rng.random(view.mask_count) >= share)
 
     return replace(scene, views=tuple(map(without, scene.views)))
+
+
+def _eroded(scene: Scene, pixels: float, _: np.random.Generator) -> Scene:
+    def smaller(view: View) -> View:
+        ids, cross = view.mask_map().astype(np.float32), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        inside = (cv2.erode(ids, cross) == cv2.dilate(ids, cross)).astype(np.uint8)
+        edge = (ids >= 0) & (cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) < pixels)
+        left = np.where(edge, -1, ids).astype(np.int32)
+        return _with_some(view, left, np.isin(np.arange(view.mask_count), left))
+
+    return replace(scene, views=tuple(map(smaller, scene.views)))
+
+
+def _with_some(view: View, ids: NDArray[np.int32], kept: NDArray[np.bool_]) -> View:
+    """The view with these of its masks. ids: (H, W) its masks, -1 and NOT_SEEN elsewhere."""
+    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    tracks = None if view.mask_tracks is None else view.mask_tracks[kept]
+    fewer = np.where(ids >= 0, np.append(number, -1)[ids], ids).astype(np.int32)
+    return replace(view, masks=fewer, mask_features=view.mask_features[kept], mask_tracks=tracks, cut_from=None)
 
 
 def _colors(scene: Scene, kept: str, rng: np.random.Generator) -> Scene:
@@ -114,5 +132,5 @@ def _colors(scene: Scene, kept: str, rng: np.random.Generator) -> Scene:
 
 WAYS: Mapping[str, Callable[[Scene, Any, np.random.Generator], Scene]] = {
     "views": _views, "points": _points, "noise": _noise, "strays": _strays, "poses": _poses, "masks": _masks,
-    "colors": _colors,
+    "eroded": _eroded, "colors": _colors,
 }  # fmt: skip
