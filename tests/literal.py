@@ -158,12 +158,11 @@ def _likely_states(
     shown = {(view, k) for view, k in zip(mask_view, group, strict=True) if k >= 0}
     within = {s: {int(clear[g]) for g in points if clear[g] >= 0 and said[:, s, g].any()} for s in range(*sizes)}
     may: list[set[int]] = []
-    in_masks: list[set[int]] = []
     for g in points:
         near = {int(best[other]) for other in neighbors[g] if best[other] >= 0}
         reported = [k for k in range(background) if said[:, k, g].any()]
-        in_masks.append({k for r in reported for k in within.get(r, [r])})
-        may.append({*in_masks[g], *near, background} if votes.weight[:, g].any() else set())
+        in_masks = {k for r in reported for k in within.get(r, [r])}
+        may.append({*in_masks, *near, background} if votes.weight[:, g].any() else set())
     likely = [{k: float(k == (background if clear[g] == BACKGROUND else clear[g])) for k in may[g]} for g in points]
     for _ in range(by.EM_ROUNDS):
         chance = np.zeros((views, background + 1, background + 1))
@@ -183,8 +182,7 @@ def _likely_states(
                     part = said[view, :, g] / said[view, :, g].sum()
                     hidden = (1 - sees[view]) * by.HIDDEN_REPORT_PROBABILITY
                     total += part @ np.log(sees[view] * chance[view, k] + hidden)
-                of_instance = 0 if k in in_masks[g] else -by.NO_MASK_LOG_PENALTY
-                prior = by.BACKGROUND_LOG_PRIOR if k == background else of_instance
+                prior = by.BACKGROUND_LOG_PRIOR if k == background else 0
                 of_point[k] = total / max(1, sees.sum() / by.MAX_INDEPENDENT_VIEWS) + prior
             evidence.append(of_point)
         likely = [dict.fromkeys(of, 0.0) for of in may]

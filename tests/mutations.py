@@ -103,12 +103,8 @@ MUTATIONS = (
         "max(1.0, total_seen / MAX_INDEPENDENT_VIEWS)", "1.0", MEMBERSHIP,
     ),
     Mutation(
-        "no mask on a point costs nothing", "fitting/view_reports.py",
-        "np.where(candidates.in_mask, 0, -NO_MASK_LOG_PENALTY)", "np.where(candidates.in_mask, 0.0, 0.0)", MEMBERSHIP,
-    ),
-    Mutation(
         "background is as likely as any instance", "fitting/view_reports.py",
-        "= BACKGROUND_LOG_PRIOR", "+= 0.0", MEMBERSHIP,
+        "candidates.background, BACKGROUND_LOG_PRIOR, 0.0)", "candidates.background, 0.0, 0.0)", MEMBERSHIP,
     ),
     Mutation(
         "what lies in a mask without a group lies in none", "fitting/view_reports.py",

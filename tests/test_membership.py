@@ -90,8 +90,8 @@ ON_A_LINE: dict[str, tuple[list[HandView], list[int], list[tuple[int, int]]]] = 
     "points at share 0.5 in a row are reached from the sure ones, those at 0.17 behind them are not": (
         [[(range(N), ONE)], *[[(range(90), ONE)]] * 2, *[[(OBJECT, ONE)]] * 3], [0] * 6, [(0, 90), (-1, 10)]
     ),
-    "masks without a group have no say": (
-        [[(OBJECT, ONE), (range(50, N), ONE)]] * 3, [0, -1] * 3, [(0, 50), (-1, 50)]
+    "masks without a group have no say: a point that they alone show follows the object beside it": (
+        [[(OBJECT, ONE), (range(50, N), ONE)]] * 3, [0, -1] * 3, [(0, 51), (-1, 49)]
     ),
     "of groups that cover a point alike the lower is taken": ([[(OBJECT, ONE)]] * 2, [1, 0], [(0, 50), (-1, 50)]),
 }  # fmt: skip

@@ -42,8 +42,6 @@ MAX_INDEPENDENT_VIEWS = 3.0
 PRIOR_COUNT = 10.0
 """Pseudo-count, in points, of the report that a view without errors gives: its own mask of an instance, and no mask for
 background and for instances that it has no mask of."""
-NO_MASK_LOG_PENALTY = 2.0
-"""Subtracted from the log-likelihood of an instance where no view has a mask of it on the point."""
 BACKGROUND_LOG_PRIOR = 0.2
 """Log-prior of background over any instance: a wrong name is worse than none."""
 SMOOTHNESS = 0.6
@@ -82,13 +80,11 @@ class ViewReports:
 class LikelyStates:
     """The candidate states of each point: state[start[g] : start[g + 1]], groups and, last, the background number; none
     where no view sees the point. Candidates are the groups of the masks that the point lies in, the groups that
-    spanning masks around it span, the groups of adjoining points, and background. in_mask: (all,) bool, False for those
-    of adjoining points only. probability: (all,) float64, sums to 1 for each point. group_count: number of groups.
-    background: its number."""
+    spanning masks around it span, the groups of adjoining points, and background. probability: (all,) float64, sums to
+    1 for each point. group_count: number of groups. background: its number."""
 
     start: NDArray[np.int64]
     state: NDArray[np.int32]
-    in_mask: NDArray[np.bool_]
     probability: NDArray[np.float64]
     group_count: int
     background: int
@@ -190,16 +186,15 @@ def _candidates(
         masks, views = chunk()
         found.append(_candidates_of_points(masks, views[0], low, group, groups, span, adjacency))
         low += len(masks[0]) - 1
-    counts, state, masked = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    counts, state = (np.concatenate(parts) for parts in zip(*found, strict=True))
     probability = (state == np.repeat(clear, counts)).astype(np.float64)
-    return LikelyStates(np.concatenate([[0], np.cumsum(counts)]), state, masked, probability, groups, background)
+    return LikelyStates(np.concatenate([[0], np.cumsum(counts)]), state, probability, groups, background)
 
 
 @njit(cache=True)
 def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency):  # noqa: ANN001, ANN202
-    """Of the points from ``low`` on: (n,) their numbers of candidates; (all,) the candidates; and (all,) whether the
-    point lies in a mask of each. span: (start, groups) of spanning masks. adjacency: (best group, neighbors, adjoining)
-    of all points."""
+    """Of the points from ``low`` on: (n,) their numbers of candidates, and (all,) the candidates. span: (start, groups)
+    of spanning masks. adjacency: (best group, neighbors, adjoining) of all points."""
     (mask_start, of_mask), (span_start, span_group), (best_group, neighbors, adjoining) = masks, span, adjacency
     n, capacity = len(mask_start) - 1, 0
     for e in range(len(of_mask)):
@@ -208,7 +203,6 @@ def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency
     count = np.zeros(n, np.int64)
     # Background, and at most one for each mask (or each group that it spans) and each neighbor.
     found = np.empty(n * (neighbors.shape[1] + 1) + capacity, np.int32)
-    masked = np.empty(len(found), np.bool_)
     end = 0
     for i in range(n):
         if view_start[i] == view_start[i + 1]:
@@ -217,21 +211,21 @@ def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency
         for e in range(mask_start[i], mask_start[i + 1]):
             k = group[of_mask[e].row]
             if 0 <= k < groups and not _contains(found, begin, end, k):
-                found[end], masked[end] = k, True
+                found[end] = k
                 end += 1
             for s in range(span_start[k - groups], span_start[k - groups + 1]) if k >= groups else range(0):
                 if not _contains(found, begin, end, span_group[s]):
-                    found[end], masked[end] = span_group[s], True
+                    found[end] = span_group[s]
                     end += 1
         for j in range(neighbors.shape[1]):
             k = best_group[neighbors[g, j]]
             if adjoining[g, j] and k >= 0 and not _contains(found, begin, end, k):
-                found[end], masked[end] = k, False
+                found[end] = k
                 end += 1
-        found[end], masked[end] = groups + len(span_start) - 1, True
+        found[end] = groups + len(span_start) - 1
         end += 1
         count[i] = end - begin
-    return count, found[:end].copy(), masked[:end].copy()
+    return count, found[:end].copy()
 
 
 @njit(cache=True)
@@ -253,10 +247,7 @@ def _empty_tables(
     candidates: LikelyStates,
 ) -> ViewReports:
     """The tables of all views, filled with zeros."""
-    group, mask_view = mask_reports
-    shown = np.zeros((views, candidates.background + 1), np.bool_)
-    shown[mask_view[group >= 0], group[group >= 0]] = True
-    shown[:, candidates.background] = True
+    shown = _possible_reports(mask_reports, (views, candidates.background + 1))
     report_column = np.where(shown, np.cumsum(shown, axis=1) - 1, -1).astype(np.int32)
     seen, low = np.zeros(shown.shape, np.bool_), 0
     for chunk in point_votes:
@@ -264,6 +255,17 @@ def _empty_tables(
     state_row = np.where(seen, np.cumsum(seen, axis=1) - 1, -1).astype(np.int32)
     table_start = np.concatenate([[0], np.cumsum(seen.sum(axis=1) * shown.sum(axis=1))]).astype(np.int64)
     return ViewReports(report_column, state_row, table_start, np.zeros(table_start[-1], np.float32), spanned)
+
+
+def _possible_reports(
+    mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """(views, numbers), whether a view has a mask that reports this number; the last, "no mask", every view has."""
+    group, mask_view = mask_reports
+    possible = np.zeros(shape, np.bool_)
+    possible[mask_view[group >= 0], group[group >= 0]] = True
+    possible[:, -1] = True
+    return possible
 
 
 @njit(cache=True)
@@ -373,9 +375,9 @@ def _unary_potentials(
     reports: ViewReports,
 ) -> NDArray[np.float64]:
     """(candidates,) log-prior plus log-likelihood of each, up to a constant for each point."""
-    unary, low = np.where(candidates.in_mask, 0, -NO_MASK_LOG_PENALTY), 0
-    unary[candidates.state == candidates.background] = BACKGROUND_LOG_PRIOR
-    table = reports.report_column, reports.state_row, reports.table_start, reports.probability
+    unary, low = np.where(candidates.state == candidates.background, BACKGROUND_LOG_PRIOR, 0.0), 0
+    possible = _possible_reports(mask_reports, reports.report_column.shape)
+    table = reports.report_column, reports.state_row, reports.table_start, reports.probability, possible
     for chunk in point_votes:
         votes = chunk()
         _add_log_likelihood(*votes, low, mask_reports, (candidates.start, candidates.state), visibility, table, unary)
@@ -387,7 +389,7 @@ def _unary_potentials(
 def _add_log_likelihood(masks, views, low, mask_reports, candidates, visibility, reports, unary):  # noqa: ANN001, ANN202
     """Adds to ``unary`` the log-likelihood of what views report of the points from ``low`` on."""
     (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, mask_reports
-    (start, state), (report_column, state_row, table_start, probability) = candidates, reports
+    (start, state), (report_column, state_row, table_start, probability, possible) = candidates, reports
     background = report_column.shape[1] - 1
     for i in prange(len(mask_start) - 1):
         g, e = low + i, mask_start[i]
@@ -415,6 +417,8 @@ def _add_log_likelihood(masks, views, low, mask_reports, candidates, visibility,
                         p_report = _with_floor(1.0 if k == report else 0.0)
                     elif state_row[view, k] >= 0:
                         p_report = probability[table_start[view] + state_row[view, k] * width + col]
+                    elif possible[view, k] and report_column[view, k] < 0:
+                        p_report = _with_floor(0.0)  # of such a group the view would report its own mask
                     else:
                         p_report = _with_floor(1.0 if col == _ideal_column(report_column[view, k], width) else 0.0)
                     total += vote / used_vote * np.log(p_seen * p_report + (1 - p_seen) * HIDDEN_REPORT_PROBABILITY)
