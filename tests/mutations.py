@@ -99,6 +99,18 @@ MUTATIONS = (
         "probability[c] * used_vote * visibility[g] ** 2", "probability[c]", MEMBERSHIP,
     ),
     Mutation(
+        "masks that end early stay as they are", "fitting/mask_edges.py",
+        "if short <= 0:", "if short <= 9:", ("test_mask_edges.py",),
+    ),
+    Mutation(
+        "masks are widened into others", "fitting/mask_edges.py",
+        "(ids == -1) & (away <= self.pixels)", "away <= self.pixels", ("test_mask_edges.py",),
+    ),
+    Mutation(
+        "texture outside of masks widens them", "fitting/mask_edges.py",
+        "> MIN_STANDARD_ERRORS * error", "> -1e9", ("test_mask_edges.py",),
+    ),
+    Mutation(
         "views that look alike add up", "fitting/view_reports.py",
         "max(1.0, total_seen / MAX_INDEPENDENT_VIEWS)", "1.0", MEMBERSHIP,
     ),

@@ -15,6 +15,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
+from og_pointcloud.fitting.mask_edges import with_masks_to_edges
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight
 from og_pointcloud.fitting.memory import in_file, memory_left
 from og_pointcloud.fitting.photographs import Photographs
@@ -86,7 +87,7 @@ def fit(
     with WorkFolder.open(work) as kept:
         if needs_tiles(scene, settings):
             _check(scene, journal)
-            labelling, spacing = fit_tiles(scene, settings, kept, journal, executor)
+            labelling, spacing = fit_tiles(_with_edges(scene, journal), settings, kept, journal, executor)
             cloud = _cloud_of(scene, labelling, spacing, settings, journal)
         else:
             prepared = prepare(scene, settings, journal, kept)
@@ -121,6 +122,8 @@ def prepare(
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
     _check(scene, journal)
+    if settings.mode != "paper":
+        scene = _with_edges(scene, journal)
     surface = _as_drawn(reconstruct_surface(scene, settings, journal), settings, journal)
     with WorkFolder.open(None) if work is None else nullcontext(work) as kept:
         return Prepared(scene, surface, _mask_table(surface, settings, journal, kept))
@@ -174,6 +177,12 @@ def _check(scene: Scene, journal: Journal) -> None:
     if len(scene.views) == 1:
         journal.warnings.append("only one view: nothing can contradict its masks, so every mask is an instance")
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
+
+
+def _with_edges(scene: Scene, journal: Journal) -> Scene:
+    """The scene with masks that end where photographs change."""
+    with journal.stage("mask edges"):
+        return with_masks_to_edges(scene, journal)
 
 
 def _as_drawn(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
