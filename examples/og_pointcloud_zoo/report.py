@@ -138,6 +138,8 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
     ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
     ours.set(xlabel="mIoU, best baseline", ylabel="mIoU, ours", title="Each scene beside its best baseline")
     cost.set(xlabel="seconds of the fit", ylabel="error, 1 - mIoU", xscale="log", title="Error against seconds")
+    for set_formatter in (cost.xaxis.set_major_formatter, cost.xaxis.set_minor_formatter):
+        set_formatter("{x:g}")  # 20, not 2 x 10^1
     own.set(xlabel="reliability, which needs no truth", ylabel="mIoU", title="What a fit says of itself")
     for axes in (ours, cost, own):
         axes.grid(alpha=0.3)
