@@ -7,7 +7,7 @@ PARALLEL := -n auto --dist loadfile
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
 	@echo "make test    run the fast tests; make test-all the slow ones too, as CI does"
-	@echo "make test-release  small faults, one by one: does a test turn red? ten times the fuzzing (fifteen minutes)"
+	@echo "make test-release  small faults, one by one: does a test turn red? ten times the fuzzing (some twenty minutes)"
 	@echo "make soak    ten minutes of frames, as a robot's: is memory flat?"
 	@echo "make lint    ruff and pyright"
 	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
