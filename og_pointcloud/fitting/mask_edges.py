@@ -44,35 +44,35 @@ NORMAL_BLUR_PX = 1.5
 def with_masks_to_edges(scene: Scene, journal: Journal) -> Scene:
     """The scene with masks that end where photographs change, or as it is if they do already. journal: gets a warning
     that says by how much they were widened."""
-    pixels, size = pixels_short(scene.views)
+    pixels = pixels_short(scene.views)
     if pixels == 0:
         return scene
     journal.notes["masks_widened_px"] = pixels
+    of_size = f" of images {COMPARED_SIZE:,} px long" if max(map(_stride, scene.views)) > 1 else ""
     journal.warnings.append(
-        f"masks end {pixels} px{f' of images {COMPARED_SIZE:,} px long' if size > COMPARED_SIZE else ''} before the "
-        "photographs change, so they were widened by as much: if you erode masks, do it less"
+        f"masks end {pixels} px{of_size} before the photographs change, so they were widened by as much: if you erode "
+        "masks, do it less"
     )
     widened = (replace(view, masks=_Widened(view, pixels * _stride(view))) for view in scene.views)
     return replace(scene, views=tuple(widened))
 
 
-def pixels_short(views: Sequence[View]) -> tuple[int, int]:
-    """By how many pixels masks end before what they show, 0 if they do not, or too few views tell; and the length of
-    the longest image compared. Of images longer than COMPARED_SIZE in pixels of images of about that length."""
+def pixels_short(views: Sequence[View]) -> int:
+    """By how many pixels masks end before what they show, 0 if they do not, or too few views tell. In images longer
+    than COMPARED_SIZE, by how many of the pixels compared."""
     usable = sorted((view for view in views if view.mask_count and view.image is not None), key=lambda view: view.name)
     spread = np.unique(np.linspace(0, len(usable) - 1, min(COMPARED_VIEWS, len(usable))).round().astype(int))
-    chosen = [usable[index] for index in spread]
-    found = [contrast for view in chosen if (contrast := edge_contrast(view)) is not None]
+    found = [contrast for index in spread if (contrast := edge_contrast(usable[index])) is not None]
     if len(found) < MIN_COMPARED_VIEWS:
-        return 0, 0
+        return 0
     of_views = np.array(found)
     short = int(of_views.mean(axis=0).argmax()) - MAX_PIXELS_OUT + 1
     if short <= 0:
-        return 0, 0
+        return 0
     there, here = of_views[:, short + MAX_PIXELS_OUT - 1], of_views[:, MAX_PIXELS_OUT - 1]
     error = (there - here).std(ddof=1) / np.sqrt(len(found))
     clearly = there.mean() > MIN_CONTRAST_RATIO * here.mean() and (there - here).mean() > MIN_STANDARD_ERRORS * error
-    return (short, max(max(view.camera.width, view.camera.height) for view in chosen)) if clearly else (0, 0)
+    return short if clearly else 0
 
 
 def edge_contrast(view: View) -> NDArray[np.float64] | None:
@@ -110,6 +110,7 @@ def edge_contrast(view: View) -> NDArray[np.float64] | None:
 
 
 def _stride(view: View) -> int:
+    """One row and column in so many of a view is compared."""
     return -(-max(view.camera.width, view.camera.height) // COMPARED_SIZE)
 
 
