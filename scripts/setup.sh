@@ -61,7 +61,7 @@ install_environment() {
         "$python" -m venv --clear .venv
     fi
     rm -f "$stamp"
-    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints-cpu.txt -e '.[all,dev]' </dev/null
+    .venv/bin/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints-cpu.txt -e '.[all,dev]' </dev/null
     say "compiling the kernels"
     .venv/bin/python -W ignore scripts/warm_up.py
     fingerprint "$python" >"$stamp"
