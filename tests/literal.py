@@ -76,7 +76,8 @@ def membership(
             if not voted:
                 continue
             best[g] = voted[0]
-            sure = [k for k in voted if own[k, g] > settings.sure_share * asked[k, g]]
+            least = [max(settings.sure_share * asked[k, g], settings.swallowed_votes) for k in range(count)]
+            sure = [k for k in voted if own[k, g] > least[k]]
             if sure and best[g] not in sure and sure[0] > best[g]:  # smaller, and uncontradicted
                 best[g] = sure[0]
             share[g] = own[best[g], g] / asked[best[g], g]

@@ -189,6 +189,11 @@ MUTATIONS = (
         (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
+        "one view alone tears a piece off", "fitting/membership.py",
+        "sure, sure_votes, sure_possible = -1, swallowed_votes, 0.0", "sure, sure_votes, sure_possible = -1, 0.0, 0.0",
+        ("test_membership.py",),
+    ),
+    Mutation(
         "one vote of many makes a point clear", "fitting/membership.py",
         "(support.votes > settings.sure_votes * support.total)", "(support.votes > 0)",
         (*MEMBERSHIP, "test_membership.py"),

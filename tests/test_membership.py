@@ -308,12 +308,12 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     has_mask = random.uniform(size=(5, 6)) < 0.5
     allowed = np.array([True, True, False, True, True])
     columns = votes_of_points(votes)[0]()
-    actual = _best_group(*columns, group, has_mask, allowed, 0.45)
+    actual = _best_group(*columns, group, has_mask, allowed, 0.45, 0.1)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     per_group = np.array([in_mask[group == k].sum(axis=0) if allowed[k] else 0 * in_mask[0] for k in range(5)])
     most = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
     asked = has_mask @ vote
-    sure = np.where(per_group > 0.45 * asked, per_group, 0)
+    sure = np.where(per_group > np.maximum(0.45 * asked, 0.1), per_group, 0)
     surest = sure.argmax(axis=0)
     points = np.arange(200)
     smaller = (most >= 0) & (sure[most, points] == 0) & (sure.max(axis=0) > 0) & (surest > most)
@@ -346,6 +346,14 @@ def votes_of_views(in_mask: NDArray[np.float64], group: NDArray[np.int32], mask_
     found = np.zeros((5, 6, in_mask.shape[1]))
     np.add.at(found, (group[group >= 0], mask_view[group >= 0]), in_mask[group >= 0])
     return found
+
+
+def test_a_piece_that_one_view_alone_tears_off_stays_with_the_whole() -> None:
+    """Two views mask the whole, two end early. The piece between them is a thing of its own once two views say so."""
+    whole, rest, piece = (range(60), ONE), (range(45), ONE), (range(45, 60), ONE)
+    assert ids_of([[whole], [whole], [rest], [rest, piece]], [0, 0, 0, 0, 1]) == [0] * 60 + [BACKGROUND] * 40
+    apart = ids_of([[whole], [whole], [rest, piece], [rest, piece]], [0, 0, 0, 1, 0, 1])
+    assert apart == [0] * 45 + [1] * 15 + [BACKGROUND] * 40
 
 
 def test_what_slips_past_an_edge_is_not_grown_over() -> None:

@@ -82,7 +82,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbors", "geometry.reach",
         "grouping.witness_share", "grouping.left_out_voice", "grouping.spanning_share",
-        "membership.sure_share", "membership.sure_votes", "membership.open_share",
+        "membership.sure_share", "membership.sure_votes", "membership.swallowed_votes", "membership.open_share",
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",

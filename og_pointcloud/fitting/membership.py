@@ -9,7 +9,8 @@ Whether one mask covers a point matters less than what the *other* views say. Le
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes "not
 k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. A point in masks of
 several groups is tested for the one with the most votes. But proposers let large things swallow small ones: where that
-group's own views contradict it and a smaller group is sure, the smaller one is taken.
+group's own views contradict it and a smaller group is sure, the smaller one is taken. Not on the word of one view,
+though: no other could contradict that, and proposers tear a wall into pieces, too.
 
 Points are clear if views see them openly and agree on them. Where no view sees a point openly, its votes are
 unreliable: rays that slip through a surface agree about what lies behind it, and are wrong. Openness is relative to the
@@ -238,17 +239,18 @@ def _support(
     found = []
     for chunk in point_votes:
         votes = chunk()
-        best, *best_votes = _best_group(*votes, group, has_mask, allowed, settings.sure_share)
+        best, *best_votes = _best_group(*votes, group, has_mask, allowed, settings.sure_share, settings.swallowed_votes)
         found.append((best, *best_votes, _reweighted_share(*votes, group, mask_view, has_mask, best)))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 @njit(cache=True, parallel=True)
-def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: ANN001, ANN202
+def _best_group(masks, views, group, has_mask, allowed, sure_share, swallowed_votes):  # noqa: ANN001, ANN202
     """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total.
 
-    Where views that have a mask of that group contradict it, and a smaller group is sure, the smaller one is taken:
-    proposers let a shelf swallow the book on it in half of the views; no view that knows the book shows it as shelf.
+    Where views that have a mask of that group contradict it, and a smaller group is sure, and has more votes than
+    ``swallowed_votes``, the smaller one is taken: proposers let a shelf swallow the book on it in half of the views; no
+    view that knows the book shows it as shelf.
     """
     (mask_start, of_mask), (view_start, of_view) = masks, views
     n = len(mask_start) - 1
@@ -260,7 +262,7 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
         begin, end = mask_start[g], mask_start[g + 1]
         for e in range(view_start[g], view_start[g + 1]):
             total[g] += of_view[e].vote
-        sure, sure_votes, sure_possible = -1, 0.0, 0.0
+        sure, sure_votes, sure_possible = -1, swallowed_votes, 0.0
         for e in range(begin, end):
             k = group[of_mask[e].row]
             if k < 0 or not allowed[k]:
