@@ -111,9 +111,9 @@ class MembershipSettings(_Checked):
     """A point is clearly in an instance if more than this share of the votes of views with a mask of it is for it."""
     sure_votes: float = 0.1
     """And when it has more than this share of all votes on the point, including those of views without a mask of it."""
-    swallowed_votes: float = 1.0
-    """Where a larger instance has more votes, a smaller one that is clear is taken if it has more votes than this: what
-    one view alone has a mask of, no other can contradict."""
+    swallowed_votes: float = 1.5
+    """Where a larger instance has more votes, a smaller one that is clear is taken if it has more votes than this, half
+    way between one view's and two: what one view alone has a mask of, no other can contradict."""
     open_share: float = 0.7
     """No point is clear that is seen less openly than this share of the scene's typical openness; the less openly it is
     seen, the less the votes on it count."""
