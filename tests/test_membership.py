@@ -22,6 +22,7 @@ from og_pointcloud.fitting.membership import (
     _reweighted_share,
     _Support,
     _without_islands,
+    assign_by_votes_alone,
     assign_points,
     instance_area,
 )
@@ -354,6 +355,11 @@ def test_a_piece_that_one_view_alone_tears_off_stays_with_the_whole() -> None:
     assert ids_of([[whole], [whole], [rest], [rest, piece]], [0, 0, 0, 0, 1]) == [0] * 60 + [BACKGROUND] * 40
     apart = ids_of([[whole], [whole], [rest, piece], [rest, piece]], [0, 0, 0, 1, 0, 1])
     assert apart == [0] * 45 + [1] * 15 + [BACKGROUND] * 40
+    # Where a few of many views stand for all, one of them says as much as several.
+    table, one_alone = hand_table(N, [[whole], [whole], [rest], [rest, piece]]), groups([0, 0, 0, 0, 1])
+    around = neighborhood(on_a_line(N), GeometrySettings())
+    by_few = assign_by_votes_alone(table, view_votes(table), one_alone, around, SETTINGS)
+    assert by_few.tolist() == [0] * 45 + [1] * 15 + [BACKGROUND] * 40
 
 
 def test_what_slips_past_an_edge_is_not_grown_over() -> None:

@@ -143,11 +143,11 @@ def assign_by_votes_alone(
     table: MaskTable, votes: ViewVotes, groups: MaskGroups, around: Neighborhood, settings: MembershipSettings
 ) -> NDArray[np.int32]:
     """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all were seen equally
-    openly. For a few of many views: too few to count what each of them reports."""
-    has_mask = views_with_masks(table, groups)
+    openly. For a few of many views: too few to count what each of them reports, or to doubt what one alone shows."""
+    has_mask, settings = views_with_masks(table, groups), replace(settings, missed_chance=0.0, swallowed_votes=0.0)
     inputs = votes_of_points(votes), groups.voting_group, table.mask_view, has_mask
     support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
-    _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), replace(settings, missed_chance=0.0))
+    _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     support = _support(*inputs, ~dismissed, settings)
     ids = np.where(support.share > settings.sure_share, support.group, BACKGROUND)
     ids = np.where(support.total > 0, ids, UNOBSERVED).astype(np.int32)
