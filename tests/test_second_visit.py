@@ -15,6 +15,7 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "10_second_visit.py
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_the_next_day_a_chair_moved_a_vase_left_and_a_ball_came(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "-o", str(tmp_path)])
     runpy.run_path(str(EXAMPLE), run_name="__main__")

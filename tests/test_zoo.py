@@ -15,7 +15,7 @@ from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
 from og_pointcloud_zoo.measure import Row, measure, parsed_settings
 from og_pointcloud_zoo.outdoors import Matched, Scanner, street_room
 from og_pointcloud_zoo.report import summary
-from og_pointcloud_zoo.worse import COLOR_NOISE, COLORS, worse
+from og_pointcloud_zoo.worse import BLED_PX, COLOR_NOISE, COLORS, worse
 from scipy.spatial import cKDTree
 
 import og_pointcloud as og
@@ -308,13 +308,22 @@ def test_colors_that_say_less_leave_all_else_as_it_is():
     rgb = np.random.default_rng(0).integers(0, 255, (4000, 3)).astype(np.uint8)
     camera = og.Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
     view = View("a", camera, np.ones((8, 8), np.int32), np.eye(1, dtype=np.float32))
-    scene = Scene(Points(np.zeros((4000, 3), np.float32), np.zeros(3), rgb), (view,), "none")
-    noisy, grey, none = (worse(scene, "colors", colors).points.rgb for colors in COLORS)
+    # A grid that fills the image: at depth 8 a pixel is one unit wide.
+    x, y = np.meshgrid(np.linspace(-4, 3.9, 80), np.linspace(-4, 3.9, 50))
+    xyz = np.stack([x, y, np.full_like(x, 8)], axis=-1).reshape(-1, 3).astype(np.float32)
+    scene = Scene(Points(xyz, np.zeros(3), rgb), (view,), "none")
+    noisy, grey, none, bled = (worse(scene, "colors", colors).points.rgb for colors in COLORS)
     assert none is None
     inside = (rgb > 90) & (rgb < 165)
     assert (noisy.astype(float) - rgb)[inside].std() == pytest.approx(COLOR_NOISE, rel=0.1)
     assert np.abs(np.corrcoef(grey.astype(float) - rgb.mean(axis=1, keepdims=True), rowvar=False)[0, 1]) < 0.1
     assert np.array_equal(noisy, worse(scene, "colors", "noisy").points.rgb)
+    # Bled colors are those of points BLED_PX off along each axis; hardly any point keeps its own.
+    row_of_color = {tuple(color): row for row, color in enumerate(rgb.tolist())}
+    moved = xyz[[row_of_color[tuple(color)] for color in bled.tolist()]] - xyz
+    middle = (np.abs(xyz[:, :2]) < 1).all(axis=1)
+    assert moved[middle, :2].std(axis=0) == pytest.approx(BLED_PX, rel=0.25)
+    assert (bled == rgb).all(axis=1).mean() < 0.1
 
 
 def test_a_scene_is_made_worse_by_as_much_as_asked(scenes):

@@ -7,7 +7,8 @@ strays   this many more points, as a share of them, anywhere in the scene's box
 poses    every camera is turned in a random direction, so that its image is off by this many pixels
 masks    this share of the masks is missing
 eroded   every mask ends this many pixels before its object does, as some proposers' masks do
-colors   "noisy": the points' colors with noise; "grey": those without hue; "none": no colors
+colors   "noisy": the points' colors with noise; "grey": those without hue; "none": no colors; "bled": those of places
+         a pixel or two off, as where photographs and depth do not fit exactly
 
 The same scene and amount always give the same worse scene. It is scored at the points that the scene had before.
 """
@@ -29,7 +30,9 @@ from og_pointcloud.scene import Points, Scene, View
 
 COLOR_NOISE = 30.0
 """Standard deviation of color noise, of 255 levels: made colors are cleaner than those of a scan."""
-COLORS = ("noisy", "grey", "none")
+COLORS = ("noisy", "grey", "none", "bled")
+BLED_PX = 1.5
+"""Standard deviation, along each axis, of where a bled color comes from, in pixels of the views."""
 LADDER: Mapping[str, tuple[float, ...]] = {
     "views": (12, 8, 5, 3),
     "points": (0.5, 0.2, 0.05),
@@ -124,10 +127,27 @@ def _colors(scene: Scene, kept: str, rng: np.random.Generator) -> Scene:
     if rgb is None:
         return scene
     found = None
-    if kept != "none":
+    if kept == "bled":
+        xyz = scene.points.xyz
+        place = xyz + rng.normal(0, BLED_PX, xyz.shape) * _pixel_sizes(scene)[:, None]
+        found = rgb[np.asarray(cKDTree(xyz).query(place)[1])]
+    elif kept != "none":
         exact = rgb.astype(np.float64) if kept == "noisy" else np.repeat(rgb.mean(axis=1, keepdims=True), 3, axis=1)
         found = np.clip(exact + rng.normal(0, COLOR_NOISE, rgb.shape), 0, 255).astype(np.uint8)
     return replace(scene, points=replace(scene.points, rgb=found))
+
+
+def _pixel_sizes(scene: Scene) -> NDArray[np.float64]:
+    """(n,) the size of a pixel at each point, scene units: the median over views; 0 where no image has the point."""
+    sizes = np.full((len(scene.views), len(scene.points)), np.nan)
+    for row, camera in enumerate(view.camera for view in scene.views):
+        uv_px, depth = camera.project(scene.points.xyz)
+        inside = (depth > 0) & ((uv_px >= 0) & (uv_px < [camera.width, camera.height])).all(axis=1)
+        sizes[row, inside] = depth[inside] / camera.fx
+    shown = ~np.isnan(sizes).all(axis=0)
+    found = np.zeros(len(scene.points))
+    found[shown] = np.nanmedian(sizes[:, shown], axis=0)
+    return found
 
 
 WAYS: Mapping[str, Callable[[Scene, Any, np.random.Generator], Scene]] = {
