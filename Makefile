@@ -1,5 +1,5 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test test-all test-release soak lint check bench zoo clean
+.PHONY: help packages setup demo test test-all test-release other-pythons soak lint check bench zoo clean
 .DEFAULT_GOAL := help
 # A process a core; tests of one file stay together, since they share what is slow to make.
 PARALLEL := -n auto --dist loadfile
@@ -16,7 +16,10 @@ help:
 	@echo "make setup   only make .venv, with the libraries that Open3D and PyVista need"
 	@echo "make clean   remove .venv, out and the caches"
 
-setup:
+packages:
+	@PYTHON="$(PYTHON)" scripts/setup.sh packages
+
+setup: packages
 	@PYTHON="$(PYTHON)" scripts/setup.sh
 
 demo: setup
@@ -31,10 +34,13 @@ test-all: setup
 test-release: setup
 	@.venv/bin/python -m pytest $(PARALLEL) -m release
 
+other-pythons:
+	@scripts/other_pythons.sh
+
 soak: setup
 	@OG_POINTCLOUD_SOAK_S=600 .venv/bin/python -m pytest -s -q tests/test_trust.py -k test_soak
 
-lint: setup
+lint: packages
 	@.venv/bin/ruff check
 	@.venv/bin/ruff format --check
 	@.venv/bin/pyright --threads 2 --pythonpath .venv/bin/python

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Makes .venv with all that `make demo` and `make test` need; returns at once where that is already done.
+# With `packages`, all but the compiled kernels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -7,7 +8,8 @@ cd "$(dirname "$0")/.."
 # software renderers.
 debian_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libegl-mesa0 libgl1-mesa-dri libvulkan1 mesa-vulkan-drivers)
 supported_python='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))'
-stamp=.venv/og-pointcloud-setup
+packages_stamp=.venv/og-pointcloud-packages
+kernels_stamp=.venv/og-pointcloud-kernels
 
 say() { echo "setup: $*" >&2; }
 
@@ -60,17 +62,22 @@ install_environment() {
     if [ "$(.venv/bin/python --version 2>/dev/null)" != "$("$python" --version)" ]; then
         "$python" -m venv --clear .venv
     fi
-    rm -f "$stamp"
+    rm -f "$packages_stamp" "$kernels_stamp"
     .venv/bin/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints-cpu.txt -e '.[all,dev]' </dev/null
     # pip compiles on one core only, and the packages' own tests, too. Some files are for other Pythons and do not compile.
     .venv/bin/python -m compileall -qq -j 0 -x '/tests/' .venv/lib >/dev/null 2>&1 || true
+    fingerprint "$python" >"$packages_stamp"
+}
+
+compile_kernels() {
     say "compiling the kernels"
     .venv/bin/python -W ignore scripts/warm_up.py
-    fingerprint "$python" >"$stamp"
+    cp "$packages_stamp" "$kernels_stamp"
 }
 
 # The libraries can vanish without .venv changing (a new container with the old checkout), so they are looked at first.
 install_debian_packages
 python=$(find_python)
 [ -n "$python" ] || stop "no Python 3.10-3.13 with the venv module found; install one and name it: make PYTHON=/path/to/python3"
-[ "$(cat "$stamp" 2>/dev/null)" = "$(fingerprint "$python")" ] || install_environment "$python"
+[ "$(cat "$packages_stamp" 2>/dev/null)" = "$(fingerprint "$python")" ] || install_environment "$python"
+[ "${1:-}" = packages ] || cmp -s "$packages_stamp" "$kernels_stamp" || compile_kernels

@@ -720,7 +720,7 @@ def test_memory_is_flat_over_frames_of_many_sizes(bundle):
     tracemalloc.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells")
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_soak(bundle):
