@@ -110,18 +110,13 @@ def membership(
     agreed = (best >= 0) & (share > settings.sure_share) & (for_best > settings.sure_votes * total)
     clear = np.where(share < settings.possible_share, BACKGROUND, UNOBSERVED)
     clear = np.where(open_ == 1, np.where(agreed, best, clear), UNOBSERVED).astype(np.int32)
-    alike = np.ones((len(points),) * 2)
-    if rgb is not None:
-        sureness = np.where((clear == best) & (best >= 0), share, 1 - share) * (clear != UNOBSERVED)
-        apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
-        alike = color_ratios(rgb, clear, sureness, neighbors)[np.rint(apart).astype(int)]
     reporting = [k if k in kept else -1 for k in group]
     background = count + len(spanning)
     for number, mask in enumerate(spanning, count):
         reporting[mask] = number
     sizes = count, background
-    likely = _likely_states(votes, mask_view, reporting, sizes, clear, best, open_, neighbors, alike)
-    ids = np.array([min(of, key=lambda k: (-of[k], k)) if of else UNOBSERVED for of in likely], np.int32)
+    likely, alike = _likely_states(votes, mask_view, reporting, sizes, clear, best, open_, neighbors, rgb)
+    ids = _likeliest(likely)
     ids[ids == background] = BACKGROUND
     possible = (best >= 0) & (share > settings.possible_share) & (openly > settings.possible_openly)
     while True:  # a middling share counts where it adjoins points that are in already
@@ -144,10 +139,11 @@ def membership(
 
 def _likely_states(
     votes: Votes, mask_view: Sequence[int], group: Sequence[int], sizes: tuple[int, int], clear: Ids, best: Ids,
-    open_: Array, neighbors: list[list[int]], alike: Array,
-) -> list[dict[int, float]]:  # fmt: skip
-    """Of each point, how likely it is in each state that it may be in. sizes: groups, and background's number; between
-    them are those of masks that span several groups."""
+    open_: Array, neighbors: list[list[int]], rgb: NDArray[np.uint8] | None,
+) -> tuple[list[dict[int, float]], Array]:  # fmt: skip
+    """Of each point, how likely it is in each state that it may be in; and (n, n) how many times likelier their colors
+    are of one state than of two. sizes: groups, and background's number; between them are those of masks that span
+    several groups."""
     from og_pointcloud.fitting import view_reports as by  # needs more than a reference of choosing may
 
     background, views, points = sizes[1], len(votes.weight), range(len(clear))
@@ -165,7 +161,15 @@ def _likely_states(
         in_masks = {k for r in reported for k in within.get(r, [r])}
         may.append({*in_masks, *near, background} if votes.weight[:, g].any() else set())
     likely = [{k: float(k == (background if clear[g] == BACKGROUND else clear[g])) for k in may[g]} for g in points]
+    alike = np.ones((len(points),) * 2)
     for _ in range(by.EM_ROUNDS):
+        if rgb is not None:
+            sure = np.array([max(of.values(), default=0) for of in likely])
+            apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
+            alike = color_ratios(rgb, _likeliest(likely), sure, neighbors)[np.rint(apart).astype(int)]
+        adds = by.SMOOTHNESS * np.maximum(alike - by.MIN_COLOR_RATIO, 0) * open_
+        heard_in_all = [adds[g, neighbors[g]].sum() for g in points]
+        adds *= [[min(1, by.MAX_INFLUENCE / max(total, 1e-12))] for total in heard_in_all]
         chance = np.zeros((views, background + 1, background + 1))
         for view, k in np.ndindex(views, background + 1):
             chance[view, k, k if (view, k) in shown else background] = by.PRIOR_COUNT
@@ -191,15 +195,17 @@ def _likely_states(
             before, likely = likely, []
             for g in points:
                 heard = {
-                    k: evidence[g][k] + by.SMOOTHNESS * sum(
-                        max(alike[g, other] - by.MIN_COLOR_RATIO, 0) * open_[other] * before[other].get(k, 0)
-                        for other in neighbors[g]
-                    )
+                    k: evidence[g][k] + sum(adds[g, other] * before[other].get(k, 0) for other in neighbors[g])
                     for k in may[g]
-                }  # fmt: skip
+                }
                 total = sum(np.exp(value - max(heard.values())) for value in heard.values())
                 likely.append({k: float(np.exp(heard[k] - max(heard.values())) / total) for k in heard})
-    return likely
+    return likely, alike
+
+
+def _likeliest(states: list[dict[int, float]]) -> Ids:
+    """The likeliest state of each point, of equals the lowest; UNOBSERVED where none is possible."""
+    return np.array([min(of, key=lambda k: (-of[k], k)) if of else UNOBSERVED for of in states], np.int32)
 
 
 def _filled(ids: NDArray[np.int32], neighbors: list[list[int]]) -> NDArray[np.int32]:

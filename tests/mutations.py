@@ -144,8 +144,18 @@ MUTATIONS = (
         "max(weights[g, j] - MIN_COLOR_RATIO, 0)", "weights[g, j]", MEMBERSHIP,
     ),
     Mutation(
+        "neighbors add up", "fitting/view_reports.py",
+        "if total > MAX_INFLUENCE else 0", "if False else 0", hard("votes-certainty_by_color"),
+    ),
+    Mutation(
+        "colors are counted once", "fitting/view_reports.py",
+        "color_ratios(rgb, ids, states.probability_of(ids), around)",
+        "color_ratios(rgb, candidates.ids, candidates.probability_of(candidates.ids), around)",
+        hard("votes-certainty_by_color"),
+    ),
+    Mutation(
         "a part of a scene counts its own reports", "fitting/view_reports.py",
-        "if reports is not None:", "if False:", ("test_view_reports.py",),
+        "if known is None:", "if True:", ("test_view_reports.py",),
     ),
     Mutation(
         "hidden points taken for seen ones", "fitting/seen_colors.py",

@@ -2,8 +2,8 @@
 
 Votes are torn along borders: rays slip past edges, masks are ragged, and noise puts a point of the wall in front of the
 lamp. A point keeps its color wherever noise puts it. How much a color difference says depends on the scene (textures,
-light, how well colors and points fit each other), so it is counted there, on adjoining points whose states views are
-sure of: how often is a difference that large within one state, and how often between two?
+light, how well colors and points fit each other), so it is counted there, on adjoining points whose states are sure:
+how often is a difference that large within one state, and how often between two?
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ PRIOR_COUNT = 30
 """Pseudo-count with the color differences of all cases, added to both cases that are compared: a few counted ones say
 little. 0 and 100 label scenes within 0.0001 mIoU of it."""
 SURENESS_POWER = 4
-"""A pair of points counts by the sureness of both to this power: where views disagree, the border lies elsewhere."""
+"""A pair of points counts by the probabilities of both states to this power: where views disagree, the border lies
+elsewhere."""
 MAX_COLOR_RATIO = 9.0
 """No difference counts as more than this many times likelier within one thing than between two, or vice versa."""
 
 
 def color_ratios(
-    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sureness: NDArray[np.float64], around: Neighborhood
+    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], probability: NDArray[np.float64], around: Neighborhood
 ) -> NDArray[np.float32]:
     """(443,) float32: how many times likelier each color difference is between adjoining points of one state than of
     two. Decreasing, within 1 / MAX_COLOR_RATIO and MAX_COLOR_RATIO; 1 throughout where colors say nothing.
 
-    rgb: (n, 3) or None. ids: (n,) the state of each point. sureness: (n,) in [0, 1], how sure views are of it.
+    rgb: (n, 3) or None. ids: (n,) the state of each point. probability: (n,) in [0, 1], that it is in this state.
     """
     if rgb is None:
         return np.ones(COLOR_DIFFERENCE_BINS, np.float32)
     # In steps of 1/256 the products, and so their sums in float64, are exact: the order of points does not matter.
-    weight = np.rint(256 * sureness**SURENESS_POWER) / 256
+    weight = np.rint(256 * probability**SURENESS_POWER) / 256
     return likelihood_ratios(*_pair_counts(np.ascontiguousarray(rgb), ids, weight, around.index, around.adjoining))
 
 

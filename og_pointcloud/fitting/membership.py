@@ -43,7 +43,6 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
 from og_pointcloud.fitting.grouping import MaskGroups, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_reports import ViewReports, likely_states
@@ -121,14 +120,13 @@ def assign_points(
     typical = scene.typical_openness if scene else votes.typical_openness
     visibility = _visibility(votes.openness, settings.open_share * typical)
     clear = _clear(support, visibility, settings)
-    weights = neighbor_weights(rgb, around, color_ratios(rgb, clear, support.of_state(clear), around))
     # What each mask reports: its group, -1 for nothing, or, if it spans several, a number of its own after the groups.
     report = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.voting_group]
     report[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
     mask_reports, size = (report, table.mask_view), (votes.vote.shape[0], groups.count)
     known = scene.reports if scene else None
-    likely, reports = likely_states(
-        point_votes, mask_reports, size, clear, support.group, visibility, around, weights, known
+    likely, reports, weights = likely_states(
+        point_votes, mask_reports, size, clear, support.group, visibility, around, rgb, known
     )
     possible = (support.share > settings.possible_share) & (support.reweighted_share > settings.possible_openly)
     ids = _refined(likely.ids, support, possible, (table, groups.voting_group), around, weights, settings)
@@ -181,11 +179,6 @@ class _Support:
     def share(self) -> NDArray[np.float64]:
         """(n,) the group's share of the possible votes."""
         return self.votes / np.maximum(self.possible, 1e-12)
-
-    def of_state(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(n,) in [0, 1]: the share of the possible votes for each point's state; 0 where that is UNOBSERVED."""
-        share = np.where((self.group >= 0) & (ids == self.group), self.share, 1 - self.share)
-        return np.where(ids != UNOBSERVED, np.clip(share, 0, 1), 0)
 
 
 def _visibility(openness: NDArray[np.float32], full_openness: float) -> NDArray[np.float32]:

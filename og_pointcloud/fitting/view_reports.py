@@ -17,8 +17,9 @@ because anything may stand in front of a hidden point. A mask that spans several
 not the expected one of any state: it says that the point belongs to one of the things in the mask. Log-likelihoods are
 summed over views, but count as MAX_INDEPENDENT_VIEWS independent views at most: views that look alike err alike.
 Adjoining points are the likelier to share a state the more alike their colors are (colors.py); each is influenced by
-the state probabilities of its neighbors (mean field). The reports are first counted on points whose state is clear
-without them, then again on the resulting state probabilities (EM).
+the state probabilities of its neighbors (mean field), but not by more than MAX_INFLUENCE in all: neighbors err alike,
+too. Reports and color ratios are first counted on points whose state is clear without them, then again on the resulting
+state probabilities (EM).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
 from og_pointcloud.fitting.view_votes import VotesOfPoints
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
@@ -50,10 +52,12 @@ MIN_COLOR_RATIO."""
 MIN_COLOR_RATIO = 0.5
 """Neighbors have no influence at or below this color ratio (how much likelier their color difference is within one
 thing than between two): the less colors say in a scene, the less its points follow their neighbors."""
+MAX_INFLUENCE = 16.0
+"""Neighbors that together add more than this to a state's logarithm count proportionally less."""
 MEAN_FIELD_ROUNDS = 5
 """Rounds in which points are updated by their neighbors."""
 EM_ROUNDS = 2
-"""Rounds in which reports are counted and states updated."""
+"""Rounds in which reports and color ratios are counted and states updated."""
 
 _FIXED_POINT_SCALE = float(1 << 24)
 """Counts are rounded to multiples of its reciprocal, so that their float64 sums are exact and do not depend on the
@@ -95,7 +99,7 @@ class LikelyStates:
         return _most_probable(self.start, self.state, self.probability, self.background)
 
     def probability_of(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(n,) the probability that each point is in its state of ``ids``; 0 where that is not a candidate."""
+        """(n,) the probability that each point is in its state of ``ids``; 0 where that is no candidate."""
         states = np.where(ids == BACKGROUND, self.background, ids)
         return _probability_in(self.start, self.state, self.probability, states)
 
@@ -117,31 +121,30 @@ def likely_states(
     best_group: NDArray[np.int32],
     visibility: NDArray[np.float32],
     around: Neighborhood,
-    weights: NDArray[np.float32],
-    reports: ViewReports | None = None,
-) -> tuple[LikelyStates, ViewReports]:
-    """The probability of each candidate state of each point, and what views report.
+    rgb: NDArray[np.uint8] | None,
+    known: ViewReports | None = None,
+) -> tuple[LikelyStates, ViewReports, NDArray[np.float32]]:
+    """The probability of each candidate state of each point, what views report, and the weights of neighbors.
 
     mask_reports: for each mask what it reports, a group, -1 for nothing, or, if it spans several groups, a number of
     its own after the groups; and its view. size: numbers of views and groups. clear: (n,) the state of each clear
     point, UNOBSERVED for others. best_group: (n,) the group with the most votes on each point, -1 none; it is a
-    candidate for adjoining points too. visibility: (n,) in [0, 1], scales the votes on each point. weights: of
-    neighbors (`neighbor_weights`). reports: of the whole scene that these points are part of; None: counted on them.
+    candidate for adjoining points too. visibility: (n,) in [0, 1], scales the votes on each point. rgb: (n, 3) or None.
+    known: reports of the whole scene that these points are part of; None: counted on them.
     """
-    spanned = _spanned_groups(point_votes, mask_reports[0], size[1], clear) if reports is None else reports.spanned
+    spanned = _spanned_groups(point_votes, mask_reports[0], size[1], clear) if known is None else known.spanned
     candidates = _candidates(point_votes, mask_reports[0], spanned, clear, best_group, around)
 
-    def posterior(reports: ViewReports) -> LikelyStates:  # E step
-        unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports)
-        return _mean_field(unary, candidates, around, weights, visibility)
-
-    if reports is not None:
-        return posterior(reports), reports
-    reports, states = _empty_tables(point_votes, mask_reports, size[0], spanned, candidates), candidates
+    reports = _empty_tables(point_votes, mask_reports, size[0], spanned, candidates) if known is None else known
+    states, weights = candidates, around.adjoining.astype(np.float32)
     for _ in range(EM_ROUNDS):
-        reports = _estimated_reports(point_votes, mask_reports, states, visibility, reports)
-        states = posterior(reports)
-    return states, reports
+        ids = states.ids
+        weights = neighbor_weights(rgb, around, color_ratios(rgb, ids, states.probability_of(ids), around))
+        if known is None:
+            reports = _estimated_reports(point_votes, mask_reports, states, visibility, reports)
+        unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports)
+        states = _mean_field(unary, candidates, around.index, _influences(weights, visibility, around.index))
+    return states, reports, weights
 
 
 # Candidate states ----------------------------------------------------------------------------------------------------
@@ -431,19 +434,33 @@ def _add_log_likelihood(masks, views, low, mask_reports, candidates, visibility,
 def _mean_field(
     unary: NDArray[np.float64],
     candidates: LikelyStates,
-    around: Neighborhood,
-    weights: NDArray[np.float32],
-    visibility: NDArray[np.float32],
+    neighbors: NDArray[np.int32],
+    influence: NDArray[np.float32],
 ) -> LikelyStates:
     """State probabilities from the unary potentials, then MEAN_FIELD_ROUNDS updates by the neighbors."""
     start, state, probability = candidates.start, candidates.state, np.zeros_like(unary)
-    for smoothness in (0.0, *[SMOOTHNESS] * MEAN_FIELD_ROUNDS):  # the first round is without neighbors
-        probability = _mean_field_round(start, state, unary, probability, around.index, weights, visibility, smoothness)
+    for _ in range(1 + MEAN_FIELD_ROUNDS):  # in the first, neighbors' probabilities are 0
+        probability = _mean_field_round(start, state, unary, probability, neighbors, influence)
     return replace(candidates, probability=probability)
 
 
 @njit(cache=True, parallel=True)
-def _mean_field_round(start, state, unary, probability, neighbors, weights, visibility, smoothness):  # noqa: ANN001, ANN202
+def _influences(weights, visibility, neighbors):  # noqa: ANN001, ANN202
+    """(n, k) what each neighbor adds to the logarithm of a state that it is sure of."""
+    influence = np.zeros(neighbors.shape, np.float32)
+    for g in prange(len(neighbors)):
+        total = 0.0
+        for j in range(neighbors.shape[1]):
+            other = neighbors[g, j]
+            influence[g, j] = SMOOTHNESS * max(weights[g, j] - MIN_COLOR_RATIO, 0) * visibility[other]
+            total += influence[g, j]
+        for j in range(neighbors.shape[1] if total > MAX_INFLUENCE else 0):
+            influence[g, j] *= MAX_INFLUENCE / total
+    return influence
+
+
+@njit(cache=True, parallel=True)
+def _mean_field_round(start, state, unary, probability, neighbors, influence):  # noqa: ANN001, ANN202
     """(candidates,) the probability of each from its unary potential and the previous probabilities of neighbors."""
     updated = np.ones(len(probability))
     for g in prange(len(start) - 1):
@@ -451,15 +468,14 @@ def _mean_field_round(start, state, unary, probability, neighbors, weights, visi
         if end - begin < 2:
             continue
         value = unary[begin:end].copy()
-        for j in range(neighbors.shape[1] if smoothness > 0 else 0):
+        for j in range(neighbors.shape[1]):
             other = neighbors[g, j]
-            influence = smoothness * max(weights[g, j] - MIN_COLOR_RATIO, 0) * visibility[other]
-            if influence == 0:
+            if influence[g, j] == 0:
                 continue
             for o in range(start[other], start[other + 1]):
                 for c in range(begin, end):
                     if state[c] == state[o]:
-                        value[c - begin] += influence * probability[o]
+                        value[c - begin] += influence[g, j] * probability[o]
                         break
         value = np.exp(value - value.max())
         updated[begin:end] = value / value.sum()

@@ -96,6 +96,15 @@ def borders_by_color(seed: float) -> Answer:
 
 
 @agrees(1e-6, "seed", tuple(range(4)))
+def certainty_by_color(seed: float) -> Answer:
+    """How sure the same points are where colors tell the groups, and many neighbors say more together than they may."""
+    noise = np.random.default_rng(int(seed)).normal(0, 3, (POINTS, 3))
+    rgb = (60 + 60 * (3 * np.arange(POINTS)[:, None] // POINTS) + noise).astype(np.uint8)
+    ours, (_, certainty, _) = _both(int(seed), rgb, reach=15)
+    return Answer(ours.certainty, certainty)
+
+
+@agrees(1e-6, "seed", tuple(range(4)))
 def spanning_masks_of_any_votes(seed: float) -> Answer:
     """How sure the same points are where two masks span several groups."""
     ours, (_, certainty, _) = _both(int(seed), spanning=(10, 11))
@@ -199,7 +208,7 @@ def _assigned(
 
 
 def _both(
-    seed: int, rgb: NDArray[np.uint8] | None = None, spanning: tuple[int, ...] = ()
+    seed: int, rgb: NDArray[np.uint8] | None = None, spanning: tuple[int, ...] = (), reach: int = REACH
 ) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
     """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask; the
     last mask is of none, or spans several, as all of ``spanning`` do."""
@@ -209,7 +218,7 @@ def _both(
     for mask in {*spanning, len(group) - 1}:
         group[mask] = -1
     near = [
-        sorted((o for o in range(max(0, g - REACH), min(POINTS, g + REACH + 1)) if o != g), key=lambda o: abs(o - g))
+        sorted((o for o in range(max(0, g - reach), min(POINTS, g + reach + 1)) if o != g), key=lambda o: abs(o - g))
         for g in range(POINTS)
     ]
     weights, settings = table.weights.toarray().astype(float), MembershipSettings()
