@@ -52,7 +52,7 @@ MIN_COLOR_RATIO."""
 MIN_COLOR_RATIO = 0.5
 """Neighbors have no influence at or below this color ratio (how much likelier their color difference is within one
 thing than between two): the less colors say in a scene, the less its points follow their neighbors."""
-MAX_INFLUENCE = 16.0
+MAX_INFLUENCE = 12.0
 """Neighbors that together add more than this to a state's logarithm count proportionally less."""
 MEAN_FIELD_ROUNDS = 5
 """Rounds in which points are updated by their neighbors."""
