@@ -166,8 +166,8 @@ MUTATIONS = (
         "first, second = first + prior, second + prior", "first, second = first, second", ("test_seen_colors.py",),
     ),
     Mutation(
-        "colors of points that views are not sure of are asked", "fitting/colors.py",
-        "sureness**SURENESS_POWER", "np.ones_like(sureness)", ("test_colors.py",),
+        "colors of points whose states are not sure are asked", "fitting/colors.py",
+        "probability**SURENESS_POWER", "np.ones_like(probability)", ("test_colors.py",),
     ),
     Mutation(
         "a large group keeps what a smaller one is sure of", "fitting/membership.py",
