@@ -134,7 +134,6 @@ def likely_states(
     """
     spanned = _spanned_groups(point_votes, mask_reports[0], size[1], clear) if known is None else known.spanned
     candidates = _candidates(point_votes, mask_reports[0], spanned, clear, best_group, around)
-
     reports = _empty_tables(point_votes, mask_reports, size[0], spanned, candidates) if known is None else known
     states, weights = candidates, around.adjoining.astype(np.float32)
     for _ in range(EM_ROUNDS):
