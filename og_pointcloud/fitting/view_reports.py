@@ -135,13 +135,14 @@ def likely_states(
     spanned = _spanned_groups(point_votes, mask_reports[0], size[1], clear) if known is None else known.spanned
     candidates = _candidates(point_votes, mask_reports[0], spanned, clear, best_group, around)
     reports = _empty_tables(point_votes, mask_reports, size[0], spanned, candidates) if known is None else known
+    unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports) if known else np.empty(0)
     states, weights = candidates, around.adjoining.astype(np.float32)
     for _ in range(EM_ROUNDS):
         ids = states.ids
         weights = neighbor_weights(rgb, around, color_ratios(rgb, ids, states.probability_of(ids), around))
         if known is None:
             reports = _estimated_reports(point_votes, mask_reports, states, visibility, reports)
-        unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports)
+            unary = _unary_potentials(point_votes, mask_reports, candidates, visibility, reports)
         states = _mean_field(unary, candidates, around.index, _influences(weights, visibility, around.index))
     return states, reports, weights
 
