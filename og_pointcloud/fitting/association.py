@@ -35,6 +35,9 @@ MIN_VISIBLE_SHARE = 0.1
 """A view that shows less of an instance than this share of its typical view is no evidence about it."""
 MAX_COMPARED_MASKS = 2000
 """With more masks than this, an instance is described by all of them, without comparing pairs."""
+SAME_KIND_BOUND = 2 / 3
+"""Masks are of one kind from this far on between the cosines of different things (0) and of one instance (1) in a scene.
+It is nearer to the latter, which wrongly named masks of instances lower."""
 DOMINANT_WEIGHT_RATIO = 1.5
 """One kind of masks describes an instance if it has more than this many times the weight of any other kind."""
 MIN_PART_VIEWS = 2
@@ -117,14 +120,15 @@ def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:
 def _same_kind_cosine(
     features: NDArray[np.float64], of_instance: list[NDArray[np.intp]], different: NDArray[np.float64]
 ) -> float:
-    """The cosine above which masks of one instance are of one kind: halfway between the median cosines of different
-    things (``different``) and of one instance in this scene. -1 (all are) where the two cannot be told apart."""
+    """The cosine above which masks of one instance are of one kind: SAME_KIND_BOUND, between the median cosines of
+    different things (``different``) and of one instance in this scene. -1 (all are) where these cannot be told
+    apart."""
     # Each instance counts once; pairs of all together would be gigabytes with thousands of views.
     compared = [features[members] for members in of_instance if 2 <= len(members) <= MAX_COMPARED_MASKS]
     same = [np.median((rows @ rows.T)[np.triu_indices(len(rows), 1)]) for rows in compared]
     if not same or not len(different) or np.median(same) <= np.median(different):
         return -1.0
-    return float(np.median(same) + np.median(different)) / 2
+    return float(SAME_KIND_BOUND * np.median(same) + (1 - SAME_KIND_BOUND) * np.median(different))
 
 
 def main_kind(features: NDArray[np.float64], weight: NDArray[np.float64], min_cosine: float) -> NDArray[np.bool_]:
