@@ -268,6 +268,10 @@ MUTATIONS = (
         "if first > DOMINANT_WEIGHT_RATIO * second else all_rows", "if first > 9 * second else all_rows",
         ("test_association.py",),
     ),
+    Mutation(
+        "names of a thing that is not named alike are one kind", "fitting/association.py",
+        "SAME_KIND_BOUND = 2 / 3", "SAME_KIND_BOUND = 1 / 2", ("test_association.py",),
+    ),
     # Learned modes.
     Mutation(
         "Eq. 5 of masks that share nothing with the union", "fitting/learned/matching.py",
