@@ -126,7 +126,8 @@ class MembershipSettings(_Checked):
     rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     missed_chance: float = 0.02
-    """An instance masked in one view only is noise if the probability that all others missed it is below this."""
+    """An instance masked in one view only is noise if the probability that all others missed it is below this, times
+    how much likelier the colors across its outline are within one thing than between two."""
     island_share: float = 0.15
     """A separate piece whose points show less than this share of what the main piece's do was seen through the main
     piece, and is not part of it."""

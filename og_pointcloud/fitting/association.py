@@ -36,8 +36,8 @@ MIN_VISIBLE_SHARE = 0.1
 MAX_COMPARED_MASKS = 2000
 """With more masks than this, an instance is described by all of them, without comparing pairs."""
 SAME_KIND_BOUND = 2 / 3
-"""Masks are of one kind from this far on between the cosines of different things (0) and of one instance (1) in a scene.
-It is nearer to the latter, which wrongly named masks of instances lower."""
+"""Masks are of one kind from this far on between the cosines of different things (0) and of one instance (1) in the
+scene. It is nearer to the latter, which wrongly named masks of instances lower."""
 DOMINANT_WEIGHT_RATIO = 1.5
 """One kind of masks describes an instance if it has more than this many times the weight of any other kind."""
 MIN_PART_VIEWS = 2

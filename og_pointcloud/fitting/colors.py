@@ -74,6 +74,20 @@ def neighbor_weights(
     return _weights(np.ascontiguousarray(rgb), around.index, around.adjoining, ratios)
 
 
+def outline_ratios(
+    rgb: NDArray[np.uint8] | None, group: NDArray[np.int32], count: int, around: Neighborhood,
+    ratios: NDArray[np.float32],
+) -> NDArray[np.float64]:  # fmt: skip
+    """(count,) float64: of each group, the mean ratio of the color differences across its outline, between its points
+    and adjoining ones that are not in it; 1 without any. group: (n,) int32, -1 none."""
+    if rgb is None or (ratios == 1).all():
+        return np.ones(count)
+    # Counts are whole numbers: their sums do not depend on the order of points.
+    counts = _outline_counts(np.ascontiguousarray(rgb), group, count, around.index, around.adjoining)
+    pairs = counts.sum(axis=1)
+    return np.where(pairs > 0, counts @ ratios.astype(np.float64) / np.maximum(pairs, 1), 1.0)
+
+
 @njit(cache=True)
 def color_difference(a, b):  # noqa: ANN001, ANN201
     """Euclidean distance of two colors, rounded. In float64: differences of uint8 would wrap around."""
@@ -96,6 +110,17 @@ def _pair_counts(rgb, ids, weight, neighbors, adjoining):  # noqa: ANN001, ANN20
             if adjoining[g, k] and weight[other] > 0:
                 count[int(ids[g] != ids[other]), color_difference(rgb[g], rgb[other])] += weight[g] * weight[other]
     return count
+
+
+@njit(cache=True)
+def _outline_counts(rgb, group, count, neighbors, adjoining):  # noqa: ANN001, ANN202
+    """(count, 443): pairs of a point of each group and an adjoining one outside it, by color difference."""
+    counts = np.zeros((count, COLOR_DIFFERENCE_BINS), np.int64)
+    for g in np.flatnonzero(group >= 0):
+        for k in range(neighbors.shape[1]):
+            if adjoining[g, k] and group[neighbors[g, k]] != group[g]:
+                counts[group[g], color_difference(rgb[g], rgb[neighbors[g, k]])] += 1
+    return counts
 
 
 @njit(cache=True, parallel=True)

@@ -30,7 +30,8 @@ openly, while all views say the same of a rim. So a middling share counts only i
 weighted by itself once more.
 
 If one view alone has a mask of something that the others show outside all masks, it is a thing only if that many views
-may well have missed it: the scene's other groups tell how often views miss.
+may well have missed it: the scene's other groups tell how often views miss. Its colors have a say, too: across the
+outline of a thing they differ as between two things, across that of a stain or a glitch as within one.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.fitting.colors import MAX_COLOR_RATIO, color_ratios, outline_ratios
 from og_pointcloud.fitting.grouping import MaskGroups, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_reports import ViewReports, likely_states
@@ -114,12 +116,14 @@ def assign_points(
     point_votes = votes_of_points(votes)
     inputs = point_votes, groups.voting_group, table.mask_view, has_mask
     support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
-    rate, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
-    support = _support(*inputs, ~dismissed, settings)
-
+    rate, dismissed, p_missed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     typical = scene.typical_openness if scene else votes.typical_openness
     visibility = _visibility(votes.openness, settings.open_share * typical)
     clear = _clear(support, visibility, settings)
+    dismissed |= _noise_of_one_view(p_missed, support, clear, around, rgb, settings.missed_chance)
+    if dismissed.any():
+        support = _support(*inputs, ~dismissed, settings)
+        clear = _clear(support, visibility, settings)
     # What each mask reports: its group, -1 for nothing, or, if it spans several, a number of its own after the groups.
     report = np.append(np.where(dismissed, -1, np.arange(groups.count)), -1)[groups.voting_group]
     report[groups.spanning] = groups.count + np.arange(np.count_nonzero(groups.spanning))
@@ -142,10 +146,10 @@ def assign_by_votes_alone(
 ) -> NDArray[np.int32]:
     """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all were seen equally
     openly. For a few of many views: too few to count what each of them reports, or to doubt what one alone shows."""
-    has_mask, settings = views_with_masks(table, groups), replace(settings, missed_chance=0.0, swallowed_votes=0.0)
+    has_mask, settings = views_with_masks(table, groups), replace(settings, swallowed_votes=0.0)
     inputs = votes_of_points(votes), groups.voting_group, table.mask_view, has_mask
     support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
-    _, dismissed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
+    _, dismissed, _ = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     support = _support(*inputs, ~dismissed, settings)
     ids = np.where(support.share > settings.sure_share, support.group, BACKGROUND)
     ids = np.where(support.total > 0, ids, UNOBSERVED).astype(np.int32)
@@ -179,6 +183,11 @@ class _Support:
     def share(self) -> NDArray[np.float64]:
         """(n,) the group's share of the possible votes."""
         return self.votes / np.maximum(self.possible, 1e-12)
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """(n,) whether a majority of the possible votes is for the group."""
+        return (self.group >= 0) & (self.share > 0.5)
 
 
 def _visibility(openness: NDArray[np.float32], full_openness: float) -> NDArray[np.float32]:
@@ -307,16 +316,17 @@ def _reweighted_share(masks, views, group, mask_view, has_mask, best):  # noqa: 
 
 def _contradicted(
     support: _Support, votes: ViewVotes, views: NDArray[np.integer], settings: MembershipSettings
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Detection rate per group, and the groups that are noise of the proposer. views: (groups,) number of views with a
-    mask of each.
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Detection rate per group, the groups that are noise of the proposer, and of groups that one view alone has a mask
+    of the probability that all others missed them (1 for other groups). views: (groups,) number of views with a mask of
+    each.
 
     How often the proposer misses is a property of the scene's masks: a detector may find a chair in a third of the
-    views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight.
-    Also noise is what one view alone has a mask of, where it is unlikely that all others missed it. This follows from
-    the detection rate of all groups and one more that was never detected: few groups give no exact rate.
+    views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight. The
+    probability follows from the detection rate of all groups and one more that was never detected: few groups give no
+    exact rate.
     """
-    count, sure = len(views), (support.group >= 0) & (support.share > 0.5)
+    count, sure = len(views), support.sure
     group = support.group[sure]
 
     def per_group(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -325,7 +335,7 @@ def _contradicted(
     visible, mass = per_group(support.total), per_group(support.votes)
     rate = per_group(support.possible) / np.maximum(visible, 1e-12)
     if mass.sum() == 0:
-        return rate, np.ones(count, bool)
+        return rate, np.ones(count, bool), np.ones(count)
     masked = np.asarray(votes.in_mask.sum(axis=0), np.float64).ravel()  # votes for any mask
     order = np.argsort(rate, kind="stable")
     typical = rate[order[np.searchsorted(np.cumsum(mass[order]), 0.5 * mass.sum())]]
@@ -333,7 +343,31 @@ def _contradicted(
     single = (views == 1) & (per_group(masked - support.votes) < 0.5 * points)
     detected = np.average(rate, weights=mass) * count / (count + 1)
     p_missed = (1 - detected) ** (per_group(support.total - masked) / points)
-    return rate, (rate < settings.rate_share * typical) | (mass == 0) | (single & (p_missed < settings.missed_chance))
+    return rate, (rate < settings.rate_share * typical) | (mass == 0), np.where(single, p_missed, 1.0)
+
+
+def _noise_of_one_view(
+    p_missed: NDArray[np.float64],
+    support: _Support,
+    clear: NDArray[np.int32],
+    around: Neighborhood,
+    rgb: NDArray[np.uint8] | None,
+    missed_chance: float,
+) -> NDArray[np.bool_]:
+    """(groups,) whether one view alone has a mask of a group that is no thing: others would hardly have missed a thing,
+    or the colors across its outline differ as little as within one.
+
+    p_missed: from `_contradicted`. missed_chance: dismissed is what has less than this, times how much likelier the
+    colors are within one thing than between two.
+    """
+    in_doubt = p_missed < missed_chance * MAX_COLOR_RATIO
+    if not in_doubt.any():  # nothing that colors could dismiss
+        return in_doubt
+    # What is in doubt is left out of the count of what differs between two things.
+    known = (clear != UNOBSERVED) & ~np.append(in_doubt, False)[clear]
+    ratios = color_ratios(rgb, clear, known.astype(np.float64), around)
+    group = np.where(support.sure, support.group, -1).astype(np.int32)
+    return in_doubt & (p_missed < missed_chance * outline_ratios(rgb, group, len(p_missed), around, ratios))
 
 
 @njit(cache=True)
