@@ -91,10 +91,30 @@ def membership(
     half = [k for i, k in enumerate(ascending) if sum(masses[a] for a in ascending[: i + 1]) >= sum(masses) / 2]
     kept = [k for k in range(count) if masses[k] > 0 and rates[k] >= settings.rate_share * rates[half[0]]]
     found = sum(masses[k] * rates[k] for k in range(count)) / sum(masses) * count / (count + 1)
-    for k in list(kept):  # the word of one view alone, where others would hardly all have missed a thing
-        by_others = np.mean(masked[sure[k]] - own[k, sure[k]])
-        missed = np.mean(total[sure[k]] - masked[sure[k]])
-        if len(views_of[k]) == 1 and by_others < 0.5 and (1 - found) ** missed < settings.missed_chance:
+    seen = sorted(votes.openness[votes.openness > 0])
+    typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
+    open_ = np.minimum(1, votes.openness / (settings.open_share * typical))
+
+    def clear_of(best: Ids, share: Array) -> Ids:
+        for_best = np.where(best >= 0, own[best, np.arange(len(points))], 0.0)
+        agreed = (best >= 0) & (share > settings.sure_share) & (for_best > settings.sure_votes * total)
+        clear = np.where(share < settings.possible_share, BACKGROUND, UNOBSERVED)
+        return np.where(open_ == 1, np.where(agreed, best, clear), UNOBSERVED).astype(np.int32)
+
+    # The word of one view alone, where others would hardly all have missed a thing, by the colors across its outline.
+    missed = np.ones(count)
+    for k in range(count):
+        by_others = np.mean(masked[sure[k]] - own[k, sure[k]]) if sure[k] else 1.0
+        if len(views_of[k]) == 1 and by_others < 0.5:
+            missed[k] = (1 - found) ** np.mean(total[sure[k]] - masked[sure[k]])
+    doubted = [k for k in range(count) if missed[k] < 9 * settings.missed_chance]
+    clear = clear_of(best, share)
+    counted = np.array([float(k != UNOBSERVED and k not in doubted) for k in clear])
+    alike = color_ratios(rgb, clear, counted, neighbors) if rgb is not None and doubted else np.ones(443)
+    for k in doubted:
+        across = [(g, other) for g in sure[k] for other in neighbors[g] if other not in sure[k]]
+        apart = [round(np.linalg.norm(rgb[g].astype(float) - rgb[other])) for g, other in across if rgb is not None]
+        if missed[k] < settings.missed_chance * (np.mean(alike[apart]) if apart else 1) and k in kept:
             kept.remove(k)
     best, share = best_of(kept)
     openly = np.zeros(len(points))  # the share where each vote counts by itself once more
@@ -103,13 +123,7 @@ def membership(
         by_view = np.bincount(mask_view, of_best, len(votes.weight))
         openly[g] = by_view @ votes.weight[:, g] / (votes.weight[views_of[int(best[g])], g] ** 2).sum()
 
-    seen = sorted(votes.openness[votes.openness > 0])
-    typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
-    open_ = np.minimum(1, votes.openness / (settings.open_share * typical))
-    for_best = np.where(best >= 0, own[best, np.arange(len(points))], 0.0)
-    agreed = (best >= 0) & (share > settings.sure_share) & (for_best > settings.sure_votes * total)
-    clear = np.where(share < settings.possible_share, BACKGROUND, UNOBSERVED)
-    clear = np.where(open_ == 1, np.where(agreed, best, clear), UNOBSERVED).astype(np.int32)
+    clear = clear_of(best, share)
     reporting = [k if k in kept else -1 for k in group]
     background = count + len(spanning)
     for number, mask in enumerate(spanning, count):

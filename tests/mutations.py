@@ -187,7 +187,16 @@ MUTATIONS = (
     ),
     Mutation(
         "what one view alone has a mask of is a thing", "fitting/membership.py",
-        "(p_missed < settings.missed_chance)", "(p_missed < 0)", ("test_membership.py",),
+        "in_doubt & (p_missed < missed_chance *", "in_doubt & (p_missed < 0 *", ("test_membership.py",),
+    ),
+    Mutation(
+        "whatever the colors across its outline", "fitting/membership.py",
+        "in_doubt = p_missed < missed_chance * MAX_COLOR_RATIO", "in_doubt = p_missed < missed_chance",
+        ("test_membership.py",),
+    ),
+    Mutation(
+        "an outline is all around each point", "fitting/colors.py",
+        "if adjoining[g, k] and group[neighbors[g, k]] != group[g]:", "if adjoining[g, k]:", ("test_colors.py",),
     ),
     Mutation(
         "whatever other views mask, one view is alone", "fitting/membership.py",

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 from test_membership import groups, on_a_line
 
-from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS, MAX_COLOR_RATIO, color_ratios, neighbor_weights
+from og_pointcloud.fitting.colors import (
+    COLOR_DIFFERENCE_BINS,
+    MAX_COLOR_RATIO,
+    color_ratios,
+    neighbor_weights,
+    outline_ratios,
+)
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
@@ -49,6 +55,21 @@ def test_ratios_are_those_of_the_literal_reference(seed: int, noise: float) -> N
     np.testing.assert_allclose(found, literal.color_ratios(rgb, ids, sure, lists(around)), rtol=1e-5)
     assert found[0] > 1.2 > 0.8 > found[-1]
     assert (np.diff(found) <= 0).all()
+
+
+def test_ratios_across_outlines_are_means_over_pairs_of_a_point_inside_and_one_outside() -> None:
+    random = np.random.default_rng(0)
+    around, ids, sure = grid(random)
+    rgb = colored(ids, random, 3.0)
+    ratios = color_ratios(rgb, ids, sure, around)
+    group = random.integers(-1, 3, len(ids)).astype(np.int32)
+    group[around.index[group == 2]] = 2  # is nearly all; group 3 is empty
+    found = outline_ratios(rgb, group, 4, around, ratios)
+    for k in range(4):
+        pairs = [(g, h) for g in np.flatnonzero(group == k) for h in lists(around)[g] if group[h] != k]
+        apart = [round(np.linalg.norm(rgb[g].astype(float) - rgb[h])) for g, h in pairs]
+        assert found[k] == pytest.approx(np.mean(ratios[apart]) if apart else 1, rel=1e-6)
+    np.testing.assert_array_equal(outline_ratios(None, group, 4, around, ratios), 1)
 
 
 def test_ratios_stay_within_their_bounds_where_colors_tell_all() -> None:

@@ -395,6 +395,21 @@ def test_the_word_of_one_view_alone_is_noise_where_the_others_would_hardly_all_m
     assert set(ids_of([views[0], *[[]] * 5], [0, 1])[70:90]) == {1}
 
 
+@pytest.mark.parametrize("colors", ["alike", "its own", "none"])
+def test_what_one_view_alone_has_a_mask_of_is_noise_where_colors_do_not_change_at_its_outline(colors: str) -> None:
+    """That three views missed it is nearly too unlikely; that they missed what looks like all around it, entirely."""
+    rgb = np.full((N, 3), 90, np.uint8)
+    rgb[OBJECT] = 200, 40, 40
+    rgb[70:90] = (40, 40, 200) if colors == "its own" else (90, 90, 90)
+    seen, blob = (OBJECT, ONE), (range(70, 90), ONE)
+    table, numbers = hand_table(N, [[seen, blob], *[[seen]] * 3]), groups([0, 1, 0, 0, 0])
+    around = neighborhood(on_a_line(), GeometrySettings())
+    settings, given = replace(SETTINGS, missed_chance=0.045), None if colors == "none" else rgb  # that it is: 0.054
+    result = assign_points(table, view_votes(table), numbers, around, settings, given)
+    assert result.dismissed.tolist() == [False, colors == "alike"]
+    assert set(result.instance_ids[70:90]) == ({BACKGROUND} if colors == "alike" else {1})
+
+
 def test_what_two_views_of_twenty_have_a_mask_of_is_noise_where_the_scene_misses_little() -> None:
     seen, blob = (OBJECT, ONE), (range(70, 90), ONE)
     views: list[HandView] = [*[[seen, blob]] * 2, *[[seen]] * 18]

@@ -104,6 +104,20 @@ def certainty_by_color(seed: float) -> Answer:
     return Answer(ours.certainty, certainty)
 
 
+@agrees(0, "color difference", (0.0, 12.0, 40.0, 120.0))
+def outline_by_color(difference: float) -> Answer:
+    """What one view alone has a mask of, and others may just about have missed: noise where the colors across its
+    outline hardly differ."""
+    thing, blob = np.arange(POINTS) < POINTS // 3, np.abs(np.arange(POINTS) - 0.75 * POINTS) < POINTS / 8
+    masks = np.array([thing, blob, *[thing] * 4], float)
+    shown = np.ones((5, POINTS))
+    noise = np.random.default_rng(0).normal(0, 4, (POINTS, 3))
+    rgb = (90 + noise + 100 * thing[:, None] + difference / np.sqrt(3) * blob[:, None]).astype(np.uint8)
+    table = _made(masks, shown - np.array([masks[0] + masks[1], *masks[2:]]) * shown, shown, [0, 0, 1, 2, 3, 4])
+    ours, (ids, *_) = _by_both(table, [0, 1, 0, 0, 0, 0], rgb)
+    return Answer(ours.instance_ids, ids)
+
+
 @agrees(1e-6, "seed", tuple(range(4)))
 def spanning_masks_of_any_votes(seed: float) -> Answer:
     """How sure the same points are where two masks span several groups."""
@@ -217,6 +231,14 @@ def _both(
     group[3 + seed % 3] = 3
     for mask in {*spanning, len(group) - 1}:
         group[mask] = -1
+    return _by_both(table, group, rgb, spanning, reach)
+
+
+def _by_both(
+    table: MaskTable, group: list[int], rgb: NDArray[np.uint8] | None, spanning: tuple[int, ...] = (),
+    reach: int = REACH,
+) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:  # fmt: skip
+    """Membership of points on a line by the library and by the literal form."""
     near = [
         sorted((o for o in range(max(0, g - reach), min(POINTS, g + reach + 1)) if o != g), key=lambda o: abs(o - g))
         for g in range(POINTS)
