@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,6 +87,9 @@ PROCESSORS = {
 @pytest.mark.parametrize("processor", PROCESSORS)
 def test_another_processor_gives_the_same_room(capture, processor):
     """Down to the bit but for the features, whose sums over 512 values may end in another last digit."""
+    flags = Path("/proc/cpuinfo")
+    if processor == "new" and not (flags.is_file() and "avx512" in flags.read_text()):
+        pytest.skip("this processor lacks AVX-512, which SkylakeX's matrix products need")
     code = "import test_room as t; c = t.make_capture(3, t.SMALL); print(t._digest(c), *t._sums(c))"
     paths = os.pathsep.join([os.path.dirname(__file__), *sys.path])
     settings = {**os.environ, **PROCESSORS[processor], "PYTHONPATH": paths}

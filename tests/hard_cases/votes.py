@@ -106,8 +106,7 @@ def certainty_by_color(seed: float) -> Answer:
 
 @agrees(0, "color difference", (0.0, 12.0, 40.0, 120.0))
 def outline_by_color(difference: float) -> Answer:
-    """What one view alone has a mask of, and others may just about have missed: noise where the colors across its
-    outline hardly differ."""
+    """What one view alone has a mask of is noise where the colors across its outline hardly differ."""
     thing, blob = np.arange(POINTS) < POINTS // 3, np.abs(np.arange(POINTS) - 0.75 * POINTS) < POINTS / 8
     masks = np.array([thing, blob, *[thing] * 4], float)
     shown = np.ones((5, POINTS))
