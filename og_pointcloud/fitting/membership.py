@@ -366,7 +366,7 @@ def _noise_of_one_view(
     # What is in doubt is left out of the count of what differs between two things.
     known = (clear != UNOBSERVED) & ~np.append(in_doubt, False)[clear]
     ratios = color_ratios(rgb, clear, known.astype(np.float64), around)
-    group = np.where(support.sure, support.group, -1).astype(np.int32)
+    group = np.where(support.sure & in_doubt[support.group], support.group, -1).astype(np.int32)
     return in_doubt & (p_missed < missed_chance * outline_ratios(rgb, group, len(p_missed), around, ratios))
 
 
