@@ -6,6 +6,7 @@ numbers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -295,16 +296,39 @@ def compared_colors(
     camera: Camera, image: NDArray[np.uint8], xyz: Array, rgb: NDArray[np.uint8], near: float, exposure: Array
 ) -> tuple[list[int], Array]:
     """Of each point that a view exposes the difference of its color from its pixel's, 443 where there is none; and how
-    often points differ so far, (2, 443): exposed ones, by 256ths of their exposure, and others in the image."""
-    found, count = [], np.zeros((2, 443))
-    for point, color, open_ in zip(xyz, rgb, exposure, strict=True):
+    often points differ so far, (2, 443): exposed ones, by 256ths of their exposure, and others in the image. Pixels
+    are those of the photograph divided by its gains."""
+    pixels: list[Array | None] = []
+    for point in xyz:
         (u, v), depth = (values[0] for values in camera.project(point[None]))
+        inside = depth > near and 0 <= u < camera.width and 0 <= v < camera.height and image[int(v), int(u)].any()
+        pixels.append(image[int(v), int(u)].astype(float) if inside else None)
+    gains = exposure_gains(rgb, pixels, exposure)
+    found, count = [], np.zeros((2, 443))
+    for pixel, color, open_ in zip(pixels, rgb, exposure, strict=True):
         apart = 443
-        if depth > near and 0 <= u < camera.width and 0 <= v < camera.height and image[int(v), int(u)].any():
-            apart = round(np.linalg.norm(color.astype(float) - image[int(v), int(u)].astype(float)))
+        if pixel is not None:
+            apart = round(np.linalg.norm(color.astype(float) - np.minimum(pixel / gains, 255)))
             count[int(open_ == 0), apart] += round(256 * open_) / 256 if open_ else 1
         found += [apart] if open_ else []
     return found, count
+
+
+def exposure_gains(rgb: NDArray[np.uint8], pixels: Sequence[Array | None], exposure: Array) -> Array:
+    """(3,) of each channel the median of pixel / point over exposed points, in steps of half a percent up to 300, by
+    brightness and 256ths of the exposure; 30 points of level 128 without any gain count as well."""
+    gains = np.ones(3)
+    for channel in range(3):
+        steps, weights = [0], [30 * 128.0]
+        for pixel, color, open_ in zip(pixels, rgb, exposure, strict=True):
+            if pixel is not None and open_ and color[channel]:
+                step = round(math.log(max(pixel[channel], 0.5) / color[channel]) / 0.005)
+                steps.append(min(max(step, -300), 300))
+                weights.append(round(256 * open_) / 256 * color[channel])
+        order = np.argsort(steps, kind="stable")
+        below = np.cumsum(np.array(weights)[order])
+        gains[channel] = math.exp(0.005 * steps[order[np.flatnonzero(below >= below[-1] / 2)[0]]])
+    return gains
 
 
 def believed(exposure: float, ratio: float) -> float:

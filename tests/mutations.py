@@ -162,6 +162,15 @@ MUTATIONS = (
         "likelihood_ratios(*counts)", "likelihood_ratios(*counts[::-1])", ("test_seen_colors.py",),
     ),
     Mutation(
+        "pixels are compared as they were exposed", "fitting/seen_colors.py",
+        "np.minimum(np.arange(256) / gains[:, None], 255)", "np.arange(256.0) + 0 * gains[:, None]",
+        ("test_seen_colors.py",),
+    ),
+    Mutation(
+        "a few points tell the gain of a photograph", "fitting/seen_colors.py",
+        "GAIN_PRIOR = 30 * 128.0", "GAIN_PRIOR = 0.0", ("test_seen_colors.py",),
+    ),
+    Mutation(
         "few colors say as much as many", "fitting/colors.py",
         "first, second = first + prior, second + prior", "first, second = first, second", ("test_seen_colors.py",),
     ),

@@ -131,6 +131,66 @@ def test_photographs_of_noise_change_no_label(seed: int) -> None:
     assert (found == by_geometry).mean() > 0.97
 
 
+def adjusted(view: View, gains: NDArray[np.float64]) -> View:
+    """The view as its camera would have taken it with other exposure and white balance."""
+    assert isinstance(view.image, np.ndarray)
+    return replace(view, image=np.clip(np.rint(view.image * gains), 1, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.8, 1.3])
+def test_exposure_and_white_balance_of_photographs_hardly_matter(gain: float) -> None:
+    points, views, table = street(np.random.default_rng(0))
+    expected = doubted_by_color(table, points, views, NEAR).exposure
+    points, views, table = street(np.random.default_rng(0))
+    views[0] = adjusted(views[0], gain * np.array([1, 0.9, 1.05]))
+    found = doubted_by_color(table, points, views, NEAR).exposure
+    assert np.abs((found - expected).data).mean() < 0.02
+    # Without the gain, the ground of that view is taken for hidden, as it is elsewhere below the car.
+    ground = np.setdiff1d(np.arange(AREA), np.concatenate([CAR, BELOW]))
+    assert found.toarray()[0, ground].mean() > 0.6 > 0.3 > found.toarray()[0, BELOW].mean()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_other_gain_leaves_less_difference(seed: int) -> None:
+    """The gain of a gray photograph from its differences: least at the one that is found, but for its prior."""
+    random = np.random.default_rng(seed)
+    rgb = np.repeat(random.integers(1, 180, (AREA, 1)), 3, axis=1).astype(np.uint8)
+    image = np.clip(np.rint(1.3 * rgb + random.normal(0, 10, (AREA, 1))), 1, 255).astype(np.uint8)
+    image[:60] = 20  # hidden after all
+    points, view = (
+        replace(street(random)[0].take(np.arange(AREA)), rgb=rgb),
+        made_view("a", image.reshape(SIDE, SIDE, 3)),
+    )
+    found, _ = differences(points, view, NEAR, np.arange(AREA, dtype=np.int32), np.ones(AREA, np.float32))
+    gains = np.exp(np.arange(-300, 301) * 0.005)[:, None]
+    left = np.abs(image[:, 0].astype(float) - gains * rgb[:, 0])
+    prior = np.abs(1 - gains[:, 0]) * 30 * 128
+    best = gains[(left.sum(axis=1) + prior).argmin(), 0]
+    apart = np.abs(np.minimum(image / best, 255) - rgb)
+    assert np.abs(found - np.linalg.norm(apart, axis=1)).max() < 3
+
+
+@pytest.mark.parametrize("levels", [(0, 255), (255, 0), (255, 255), (1, 1)])
+def test_extreme_levels_have_finite_differences(levels: tuple[int, int]) -> None:
+    """Black points, and photographs that are over- or underexposed throughout."""
+    of_points, of_image = levels
+    points = street(np.random.default_rng(0))[0].take(np.arange(AREA))
+    points = replace(points, rgb=np.full((AREA, 3), of_points, np.uint8))
+    view = made_view("a", np.full((SIDE, SIDE, 3), max(of_image, 1), np.uint8))
+    rows = np.arange(AREA, dtype=np.int32)
+    found, counts = differences(points, view, NEAR, rows, np.ones(AREA, np.float32))
+    assert (found < NO_DIFFERENCE).all()
+    assert counts.sum() == AREA
+
+
+def test_a_few_points_tell_no_gain() -> None:
+    """Of three points in front of another thing, the color stays as different as it is."""
+    points = replace(street(np.random.default_rng(0))[0].take(np.arange(3)), rgb=np.full((3, 3), 200, np.uint8))
+    view = made_view("a", np.full((SIDE, SIDE, 3), 80, np.uint8))
+    found, _ = differences(points, view, NEAR, np.arange(3, dtype=np.int32), np.ones(3, np.float32))
+    assert (found == round(120 * np.sqrt(3))).all()
+
+
 def test_beliefs_do_not_depend_on_the_order_of_points() -> None:
     points, views, table = street(np.random.default_rng(0))
     order = np.random.default_rng(1).permutation(2 * AREA)

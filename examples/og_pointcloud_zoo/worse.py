@@ -9,6 +9,8 @@ masks    this share of the masks is missing
 eroded   every mask ends this many pixels before its object does, as some proposers' masks do
 colors   "noisy": the points' colors with noise; "grey": those without hue; "none": no colors; "bled": those of places
          a pixel or two off, as where photographs and depth do not fit exactly
+exposure every photograph is brighter or darker by a factor, whose logarithm has this standard deviation, and its
+         channels by factors of a quarter of it, as those of a camera are that adjusts itself
 
 The same scene and amount always give the same worse scene. It is scored at the points that the scene had before.
 """
@@ -41,6 +43,7 @@ LADDER: Mapping[str, tuple[float, ...]] = {
     "poses": (1, 2, 4, 8),
     "masks": (0.25, 0.5, 0.75),
     "eroded": (1, 2, 4),
+    "exposure": (0.1, 0.2, 0.4),
 }
 """The amounts tried of each kind, from little to much."""
 
@@ -137,6 +140,16 @@ def _colors(scene: Scene, kept: str, rng: np.random.Generator) -> Scene:
     return replace(scene, points=replace(scene.points, rgb=found))
 
 
+def _exposure(scene: Scene, spread: float, rng: np.random.Generator) -> Scene:
+    def adjusted(view: View) -> View:
+        image, factors = view.image_rgb(), np.exp(rng.normal(0, spread) + rng.normal(0, spread / 4, 3))
+        if image is None:
+            return view
+        return replace(view, image=np.clip(np.rint(image * factors), 0, 255).astype(np.uint8))
+
+    return replace(scene, views=tuple(map(adjusted, scene.views)))
+
+
 def _pixel_sizes(scene: Scene) -> NDArray[np.float64]:
     """(n,) the size of a pixel at each point, scene units: the median over views; 0 where no image has the point."""
     sizes = np.full((len(scene.views), len(scene.points)), np.nan)
@@ -152,5 +165,5 @@ def _pixel_sizes(scene: Scene) -> NDArray[np.float64]:
 
 WAYS: Mapping[str, Callable[[Scene, Any, np.random.Generator], Scene]] = {
     "views": _views, "points": _points, "noise": _noise, "strays": _strays, "poses": _poses, "masks": _masks,
-    "eroded": _eroded, "colors": _colors,
+    "eroded": _eroded, "colors": _colors, "exposure": _exposure,
 }  # fmt: skip

@@ -3,7 +3,9 @@
 Rays slip between points: a view then says of the ground below a car what its masks say of the car. But the pixel has
 the car's color, the point the ground's. How much a color difference says (light, lens, noise, how well cloud and
 photographs fit) varies by scene. So it is counted there, over all views: how often is a difference that large at points
-that a view sees by geometry, and how often at points in the image that are hidden? With
+that a view sees by geometry, and how often at points in the image that are hidden? Cameras adjust exposure and white
+balance from one photograph to the next, which says nothing about points: pixels are compared without the factor by
+which each channel of their photograph is brighter than the points that it shows. With
 
     r    how many times likelier the difference is at seen points than at hidden ones
     p    the prior: SEEN_PRIOR times the exposure
@@ -35,6 +37,10 @@ from og_pointcloud.scene import Points, View
 SEEN_PRIOR = 0.5
 """Probability, before colors, that a view sees a point that is open by geometry: half of what seems open may be
 hidden."""
+GAIN_STEP, MAX_GAIN_STEPS = 0.005, 300
+"""Gains are found in steps of half a percent, between 1/4.5 and 4.5."""
+GAIN_PRIOR = 30 * 128.0
+"""Pseudo-weight of a gain of 1, as of 30 points of middle brightness: of a few points, hidden ones may be many."""
 NO_DIFFERENCE = COLOR_DIFFERENCE_BINS
 """Stands for a missing difference: the view has no photograph, or the point is not in it."""
 
@@ -69,19 +75,20 @@ def doubted_by_color(
 def differences(
     points: Points, view: View, near: float, columns: NDArray[np.int32], exposure: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint16], Doubles]:
-    """For each point that a view shows, the rounded distance of its color from its pixel's, or NO_DIFFERENCE; and how
-    often each distance occurs in the image, (2, 443): at shown points, weighted by exposure, and at hidden ones.
+    """For each point that a view shows, the rounded distance of its color from its pixel's (without the photograph's
+    gains), or NO_DIFFERENCE; and how often each distance occurs in the image, (2, 443): at shown points, weighted by
+    exposure, and at hidden ones.
 
     columns: (k,) rows of the points that the view shows, ascending. exposure: (k,) theirs, in (0, 1].
     """
     image = view.image_rgb()
     if image is None or points.rgb is None:
         return np.full(len(columns), NO_DIFFERENCE, np.uint16), np.zeros((2, COLOR_DIFFERENCE_BINS))
-    camera = view.camera
-    return _compared(
-        points.xyz, np.ascontiguousarray(points.rgb), np.ascontiguousarray(image), np.array(camera.intrinsics),
-        camera.world_to_camera, near, columns, exposure,
-    )  # fmt: skip
+    camera, rgb, image = view.camera, np.ascontiguousarray(points.rgb), np.ascontiguousarray(image)
+    pixels = _pixels(points.xyz, image, np.array(camera.intrinsics), camera.world_to_camera, near)
+    gains = _gains(rgb, image, pixels, columns, exposure)
+    evened = np.minimum(np.arange(256) / gains[:, None], 255)
+    return _compared(rgb, image, evened, pixels, columns, exposure)
 
 
 def with_photograph(view: View) -> tuple[View, str]:
@@ -99,29 +106,67 @@ def warn_of_faults(faults: Sequence[str], journal: Journal) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _compared(xyz, rgb, image, intrinsics, pose, near, columns, exposure):  # noqa: ANN001, ANN202
+def _pixels(xyz, image, intrinsics, pose, near):  # noqa: ANN001, ANN202
+    """(n, 2) int32: row and column of each point's pixel; -1 where the image shows nothing of it."""
     fx, fy, cx, cy = intrinsics
     height, width = image.shape[:2]
-    difference, counts = np.full(len(columns), NO_DIFFERENCE, np.uint16), np.zeros((2, COLOR_DIFFERENCE_BINS))
-    next_shown = 0
+    pixels = np.full((len(xyz), 2), -1, np.int32)
     for g in range(len(xyz)):
-        is_shown = next_shown < len(columns) and columns[next_shown] == g
-        next_shown += is_shown
         depth, x, y = depth_and_slopes(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
         u, v = fx * x + cx, fy * y + cy
-        if not (depth > near and 0 <= u < width and 0 <= v < height):
+        # Black: the photograph shows nothing there, as beyond a lens's rim.
+        if depth > near and 0 <= u < width and 0 <= v < height and image[int(v), int(u)].max() > 0:
+            pixels[g] = int(v), int(u)
+    return pixels
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gains(rgb, image, pixels, columns, exposure):  # noqa: ANN001, ANN202
+    """(3,) of each channel the gain with the least sum of |pixel - gain point|, weighted by exposure: the median of
+    pixel / point, weighted by exposure and brightness. Hidden points among those shown hardly move it."""
+    weight = np.zeros((3, 2 * MAX_GAIN_STEPS + 1))
+    weight[:, MAX_GAIN_STEPS] = GAIN_PRIOR
+    for e, g in enumerate(columns):
+        v, u = pixels[g]
+        for channel in range(3 if v >= 0 else 0):
+            point, pixel = np.float64(rgb[g, channel]), np.float64(image[v, u, channel])
+            if point > 0:
+                step = np.rint(np.log(max(pixel, 0.5) / point) / GAIN_STEP)
+                place = MAX_GAIN_STEPS + int(min(max(step, -MAX_GAIN_STEPS), MAX_GAIN_STEPS))
+                weight[channel, place] += _in_256ths(exposure[e]) * point
+    gains = np.empty(3)
+    for channel in range(3):
+        total = np.cumsum(weight[channel])
+        gains[channel] = np.exp(GAIN_STEP * (np.searchsorted(total, total[-1] / 2) - MAX_GAIN_STEPS))
+    return gains
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compared(rgb, image, evened, pixels, columns, exposure):  # noqa: ANN001, ANN202
+    """`differences`. evened: (3, 256) the levels of each channel without its gain."""
+    difference, counts = np.full(len(columns), NO_DIFFERENCE, np.uint16), np.zeros((2, COLOR_DIFFERENCE_BINS))
+    next_shown, color = 0, np.empty(3)
+    for g in range(len(rgb)):
+        is_shown = next_shown < len(columns) and columns[next_shown] == g
+        next_shown += is_shown
+        v, u = pixels[g]
+        if v < 0:
             continue
-        pixel = image[int(v), int(u)]
-        if pixel.max() == 0:  # black: the photograph shows nothing there, as beyond a lens's rim
-            continue
-        distance = color_difference(rgb[g], pixel)
+        for channel in range(3):
+            color[channel] = evened[channel, image[v, u, channel]]
+        distance = color_difference(rgb[g], color)
         if not is_shown:
             counts[1, distance] += 1
             continue
         difference[next_shown - 1] = distance
-        # In steps of 1/256 sums in float64 are exact: the order of points does not matter.
-        counts[0, distance] += np.rint(256 * np.float64(exposure[next_shown - 1])) / 256
+        counts[0, distance] += _in_256ths(exposure[next_shown - 1])
     return difference, counts
+
+
+@njit(cache=True)
+def _in_256ths(exposure):  # noqa: ANN001, ANN202
+    """In steps of 1/256 sums in float64 are exact: the order of points does not matter."""
+    return np.rint(256 * np.float64(exposure)) / 256
 
 
 def sight_ratios(counts: Doubles) -> NDArray[np.float32]:
