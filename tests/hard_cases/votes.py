@@ -16,8 +16,10 @@ from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.learned.matching import eq5_scores, match_masks, visible_evidence
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import Membership, assign_points
+from og_pointcloud.fitting.seen_colors import differences
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import Neighborhood
+from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import MatchingSettings, MembershipSettings
 
 POINTS, REACH = 80, 3
@@ -115,6 +117,25 @@ def outline_by_color(difference: float) -> Answer:
     table = _made(masks, shown - np.array([masks[0] + masks[1], *masks[2:]]) * shown, shown, [0, 0, 1, 2, 3, 4])
     ours, (ids, *_) = _by_both(table, [0, 1, 0, 0, 0, 0], rgb)
     return Answer(ours.instance_ids, ids)
+
+
+@agrees(0, "gain", (0.01, 0.3, 1.0, 3.0, 100.0))
+def colors_of_any_exposure(gain: float) -> Answer:
+    """How far colors of points and pixels differ where the photograph is hardly exposed, or much too long."""
+    random, side = np.random.default_rng(0), 12
+    xyz = np.append(random.uniform(-1, 1, (200, 2)), np.full((200, 1), 2.0), axis=1).astype(np.float32)
+    rgb = random.integers(0, 256, (200, 3)).astype(np.uint8)
+    camera = Camera(side, side, float(side), float(side), side / 2, side / 2, np.eye(4))
+    image = np.zeros((side, side, 3), np.uint8)
+    u, v = np.floor(camera.project(xyz)[0]).astype(int).T
+    image[v, u] = np.clip(np.rint(gain * rgb * [1, 0.8, 1.2]), 0, 255)
+    view = View("any", camera, np.full((side, side), -1, np.int32), np.zeros((0, 2), np.float32), image)
+    shown = np.flatnonzero(random.random(200) < 0.8).astype(np.int32)
+    open_ = np.zeros(200)
+    open_[shown] = 0.7
+    found, counts = differences(Points(xyz, np.zeros(3), rgb), view, 0.1, shown, open_[shown].astype(np.float32))
+    expected, expected_counts = literal.compared_colors(camera, image, xyz, rgb, 0.1, open_)
+    return Answer(np.append(found, counts), np.append(expected, expected_counts))
 
 
 @agrees(1e-6, "seed", tuple(range(4)))
