@@ -374,6 +374,18 @@ def test_a_scene_is_made_worse_by_as_much_as_asked(scenes):
         assert np.array_equal(view.mask_features[kept[kept >= 0]], features)
 
 
+def test_each_photograph_is_exposed_anew(scenes):
+    scene = read_capture(scenes[0])
+    assert all(view.image_rgb() is None for view in worse(scene, "exposure", 0.2).views)  # these have none
+    camera = og.Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
+    view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32), np.full((8, 8, 3), 100, np.uint8))
+    exposed = worse(replace(scene, views=(view,) * 400), "exposure", 0.2).views
+    levels = np.log(np.array([one.image_rgb()[0, 0] for one in exposed]) / 100)
+    assert levels.mean(axis=0) == pytest.approx([0] * 3, abs=0.04)
+    assert levels.std(axis=0) == pytest.approx([0.2 * np.sqrt(1 + 1 / 16)] * 3, rel=0.15)
+    assert (levels - levels.mean(axis=1, keepdims=True)).std() == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.15)
+
+
 def test_a_worse_scene_is_scored_at_the_points_it_had(scenes):
     truth, capture = read_truth(scenes[0]), read_capture(scenes[0])
     row = measure(scenes[0], baselines=False, changes={"points": 0.2})

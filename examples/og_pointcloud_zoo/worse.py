@@ -43,7 +43,7 @@ LADDER: Mapping[str, tuple[float, ...]] = {
     "poses": (1, 2, 4, 8),
     "masks": (0.25, 0.5, 0.75),
     "eroded": (1, 2, 4),
-    "exposure": (0.1, 0.2, 0.4),
+    "exposure": (0.2, 0.4),
 }
 """The amounts tried of each kind, from little to much."""
 
