@@ -376,10 +376,13 @@ def test_a_scene_is_made_worse_by_as_much_as_asked(scenes):
 
 def test_each_photograph_is_exposed_anew(scenes):
     scene = read_capture(scenes[0])
-    assert all(view.image_rgb() is None for view in worse(scene, "exposure", 0.2).views)  # these have none
+    blind = replace(scene, views=tuple(replace(view, image=None) for view in scene.views))
+    assert all(view.image_rgb() is None for view in worse(blind, "exposure", 0.2).views)
     camera = og.Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
-    view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32), np.full((8, 8, 3), 100, np.uint8))
-    exposed = worse(replace(scene, views=(view,) * 400), "exposure", 0.2).views
+    gray = np.full((8, 8, 3), 100, np.uint8)
+    view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32), gray)
+    many = tuple(replace(view, name=str(number)) for number in range(400))
+    exposed = worse(replace(scene, views=many), "exposure", 0.2).views
     levels = np.log(np.array([one.image_rgb()[0, 0] for one in exposed]) / 100)
     assert levels.mean(axis=0) == pytest.approx([0] * 3, abs=0.04)
     assert levels.std(axis=0) == pytest.approx([0.2 * np.sqrt(1 + 1 / 16)] * 3, rel=0.15)
