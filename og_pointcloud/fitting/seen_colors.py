@@ -8,7 +8,7 @@ balance from one photograph to the next, which says nothing about points: pixels
 which each channel of their photograph is brighter than the points that it shows. With
 
     r    how many times likelier the difference is at seen points than at hidden ones
-    p    the prior: SEEN_PRIOR times the exposure
+    p    the prior: SEEN_PRIOR times the point's exposure, its openness to the view
 
 the posterior that the view sees the point is p r / (p r + 1 - p), and becomes its exposure. How masks overlap is
 measured by geometry alone, on many points each: what is removed from the exposure is kept for it (`MaskTable.doubted`).
