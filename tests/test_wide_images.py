@@ -158,6 +158,34 @@ def test_masks_may_be_of_the_faces(panoramas):
         np.testing.assert_array_equal(view.mask_features, same.mask_features)
 
 
+MADE_WRONG = {
+    "masks=next": lambda maps: [maps[-1], *maps[:-1]],
+    "masks=mirrored": lambda maps: [ids[:, ::-1] for ids in maps],
+    "masks=from-zero": lambda maps: [np.maximum(ids, 1) - 1 for ids in maps],
+}
+
+
+@pytest.mark.parametrize("repair", MADE_WRONG)
+def test_masks_of_panoramas_are_repaired_before_they_are_split(panoramas, repair):
+    files = [panoramas / "masks" / f"pano_{index}.png" for index in range(3)]
+    maps = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
+    for ids in maps:  # row 0 is of no mask, as in files numbered from zero
+        ids[ids > 0] += 1
+    rows = np.eye(7, 8, dtype=np.float32)
+    write_features(panoramas, {"feature_space": np.array("tiny"), **{f"pano_{index}": rows for index in range(3)}})
+
+    def written_and_read(maps, repairs):
+        for file, ids in zip(files, maps, strict=True):
+            write_image(file, np.ascontiguousarray(ids))
+        return read_capture(panoramas, repairs=repairs).views
+
+    right = written_and_read(maps, [])
+    repaired = written_and_read(MADE_WRONG[repair](maps), [repair])
+    for view, same in zip(right, repaired, strict=True):
+        np.testing.assert_array_equal(view.mask_map(), same.mask_map())
+        np.testing.assert_array_equal(view.mask_features, same.mask_features)
+
+
 def test_masks_of_half_the_size_halve_the_views(panoramas):
     for file in (panoramas / "masks").glob("*.png"):
         write_image(file, np.ascontiguousarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[::2, ::2]))

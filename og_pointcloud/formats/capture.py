@@ -109,8 +109,7 @@ def read_capture(
     applied = read_repairs(capture) if repairs is None else tuple(map(Repair.parse, repairs))
     poses = read_poses(capture, applied)
     shown = _with_masks(capture, poses) if poses.is_recording or made_of_some(capture) else poses
-    layers, feature_space = _layers(capture, shown, mask_level)
-    layers = repaired_layers(layers, applied)
+    layers, feature_space = _layers(capture, shown, mask_level, applied)
     points = read_geometry(capture, poses, gaussians)  # all frames: depth counts without masks too
     files = find_images(capture, shown.images)
     views = tuple(
@@ -239,8 +238,11 @@ def _has_mask(capture: Path, name: str) -> bool:
     return any((capture / file).is_file() for file in files)
 
 
-def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list[MaskLayer], str]:
-    """The masks of each view, and the name of their feature space. Masks of a whole image are split with it."""
+def _layers(
+    capture: Path, poses: CapturePoses, level: str | None, repairs: Sequence[Repair]
+) -> tuple[list[MaskLayer], str]:
+    """The masks of each view, and the name of their feature space. Masks of a whole image are repaired, then split with
+    it."""
     faces = [image.face for image in poses.images]
     # The name that each view's masks are stored under: the image's for a cube's face without masks of its own.
     called = [
@@ -249,7 +251,7 @@ def _layers(capture: Path, poses: CapturePoses, level: str | None) -> tuple[list
     ]
     distinct = list(dict.fromkeys(called))
     read, feature_space = _read_masks(capture, distinct, level)
-    stored = dict(zip(distinct, read, strict=True))
+    stored = dict(zip(distinct, repaired_layers(read, repairs), strict=True))
     # Faces of one image share its decoded mask map.
     latest = lru_cache(maxsize=DECODED_MAPS)(lambda name: stored[name].read())
     # Masks of a whole image are cut to the view; a cube face's own masks have its pixels already.

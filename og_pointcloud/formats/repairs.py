@@ -152,7 +152,7 @@ def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> 
 
 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
-    """The masks after these repairs; layers: in the order of the pose file."""
+    """The masks after these repairs; layers: of whole images, in the order of the pose file."""
     repaired = list(layers)
     # In the order of the list: shifting images and flipping each do not depend on each other.
     for value in (repair.value for repair in repairs if repair.name == "masks"):
