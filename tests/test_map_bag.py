@@ -25,18 +25,21 @@ from og_pointcloud.errors import SceneError
 TOPICS = {"info": "/camera_info", "depth": "/depth/image_rect", "color": "/color/image_rect", "masks": "/masks",
           "features": "/mask_features"}  # fmt: skip
 KINDS = {"features": "sensor_msgs/msg/PointCloud2", "info": "sensor_msgs/msg/CameraInfo"}
+TWO_CAMERAS = {"back info": "/back/camera_info", "back color": "/back/image_rect", "info": "/front/camera_info",
+               "depth": "/front/depth/image_rect", "masks": "/front/depth/masks", "features": "/front/features",
+               "color": "/front/image_rect"}  # fmt: skip
 
 
-def write_bag(folder, given, without=(), messages=messages_of):
+def write_bag(folder, given, without=(), messages=messages_of, topics=TOPICS):
     store = ros2_types()
     make = rosbags_messages(store)
     with Writer(folder, version=8) as bag:
-        kinds = {topic: KINDS.get(role, "sensor_msgs/msg/Image") for role, topic in TOPICS.items()}
+        kinds = {topic: KINDS.get(role.split()[-1], "sensor_msgs/msg/Image") for role, topic in topics.items()}
         kinds["/tf"] = "tf2_msgs/msg/TFMessage"
         out = {t: bag.add_connection(t, kind, typestore=store) for t, kind in kinds.items() if t not in without}
         for recorded, frame in enumerate(given):
             sent = {"/tf": transform(make, "map", "camera", *place_of(frame), stamp_of(frame))}
-            sent |= {TOPICS[role]: message for role, message in messages(make, frame).items()}
+            sent |= {topics[role]: message for role, message in messages(make, frame).items()}
             for topic in out:
                 bag.write(out[topic], recorded, store.serialize_cdr(sent[topic], kinds[topic]))
     return folder
@@ -163,6 +166,46 @@ def test_rectified_images_have_the_lens_of_p(tmp_path, monkeypatch):
         raw.add(role, message)
     with pytest.raises(SceneError, match="has distortion; expected rectified images"):
         raw.frame(stamp_of(frame), lambda frame_id, stamp: np.eye(4))
+
+
+def beside_a_second_camera(make, frame):
+    messages = messages_of(make, frame)
+    other = replace(frame, camera=replace(frame.camera, fx=2 * frame.camera.fx), rgb=255 - frame.rgb)
+    for role in ("info", "color"):
+        messages[f"back {role}"] = messages_of(make, other)[role]
+        messages[f"back {role}"].header.frame_id = "back"
+    return messages
+
+
+def test_of_two_cameras_each_has_its_own_lens_and_colors(tmp_path):
+    (frame,) = frames(THINGS)[:1]
+    (read,) = BagFrames(write_bag(tmp_path / "drive", [frame], (), beside_a_second_camera, TWO_CAMERAS))
+    assert read.camera.intrinsics == frame.camera.intrinsics
+    np.testing.assert_array_equal(read.rgb, frame.rgb)  # recorded after the features
+    np.testing.assert_array_equal(read.masks, frame.masks)  # of a topic below /front/depth
+
+
+def test_a_depth_image_of_none_of_the_cameras_is_refused(tmp_path):
+    def of_a_third(make, frame):
+        messages = beside_a_second_camera(make, frame)
+        messages["depth"].header.frame_id = "third"
+        return messages
+
+    bag = write_bag(tmp_path / "drive", frames(THINGS)[:1], (), of_a_third, TWO_CAMERAS)
+    with pytest.raises(SceneError, match=r"frame_id 'third'; expected .*'camera' \(/front/camera_info\), 'back' \("):
+        BagFrames(bag)
+
+
+def test_a_frame_stands_where_its_depth_was_measured(tmp_path):
+    def color_from_elsewhere(make, frame):
+        messages = messages_of(make, frame)
+        messages["color"].header.frame_id = "color_camera"  # which tf does not know
+        return messages
+
+    late = dict(sorted(TOPICS.items(), key=lambda item: item[0] == "color"))
+    for number, topics in enumerate((TOPICS, late)):
+        bag = BagFrames(write_bag(tmp_path / str(number), frames(THINGS)[:1], (), color_from_elsewhere, topics))
+        assert (len(list(bag)), bag.dropped) == (1, {})
 
 
 @pytest.mark.parametrize("topic", ["/depth/image_rect", "/masks", "/camera_info"])

@@ -273,3 +273,4 @@ def test_what_colcon_needs_is_there():
     }
     depends = {entry.text for entry in package.findall("exec_depend")}
     assert {"rclpy", "tf2_ros", "vision_msgs", "std_srvs"} <= imported <= depends
+    assert "tf2_ros_py" in depends, "the Python module tf2_ros is a package of its own"

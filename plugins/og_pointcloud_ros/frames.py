@@ -84,7 +84,8 @@ class FrameAssembler:
             width = rows.dtype["feature"].shape or (1,)
             parts.features = np.asarray(rows["feature"], np.float32).reshape(rows.size, *width)
         else:
-            parts.frame_id = message.header.frame_id
+            if role == "depth" or not parts.frame_id:  # a color camera may stand beside that of depth
+                parts.frame_id = message.header.frame_id
             pixels = image_array(message)
             if role == "color" and pixels.ndim == 2:  # of a gray camera
                 pixels = np.repeat(pixels[..., None], 3, axis=2)
