@@ -48,10 +48,10 @@ VARINT, FIXED_64, BYTES, FIXED_32 = 0, 1, 2, 5
 
 def hub_cache() -> Path:
     """The folder of fetched models, by the environment variables of Hugging Face's tools; it need not exist."""
-    if hub := os.environ.get("HF_HUB_CACHE"):
-        return Path(hub)
-    home = os.environ.get("HF_HOME")
-    return Path(home) / "hub" if home else home_folder() / ".cache" / "huggingface" / "hub"
+    cache = os.environ.get("XDG_CACHE_HOME") or home_folder() / ".cache"
+    home = os.environ.get("HF_HOME") or os.path.join(cache, "huggingface")
+    hub = os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE") or os.path.join(home, "hub")
+    return Path(os.path.expandvars(os.path.expanduser(hub)))
 
 
 def home_folder() -> Path:

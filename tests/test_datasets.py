@@ -14,6 +14,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
 from og_pointcloud.formats.depth import resampled
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.repairs import Repair
 from og_pointcloud.formats.rgbd import COLOR_FOCAL_PX, DEPTH_FOCAL_PX
 
 COUNT = 6
@@ -158,6 +159,20 @@ def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tm
     assert scene.views[0].camera.fx == COLOR_FOCAL_PX * WIDTH / 640
     # 65535 is "not measured", not 65 m.
     assert files[names[0]].read().depth.max() < 6
+
+
+@pytest.mark.parametrize("wrong", [("color",), ("color", "depth")])
+def test_intrinsics_of_a_depth_sensor_of_its_own_are_not_repaired_with_the_photographs(tmp_path, wrong):
+    write_scannet(tmp_path)
+    right = read_poses(tmp_path).images[0]
+    for sensor in wrong:
+        file = tmp_path / f"intrinsic/intrinsic_{sensor}.txt"
+        stated = np.loadtxt(file)
+        stated[:2, :3] = 2 * stated[:2, :3] + [[0, 0, 0.5], [0, 0, 0.5]]  # centers of pixels at whole numbers
+        np.savetxt(file, stated)
+    repaired = read_poses(tmp_path, [Repair.parse("intrinsics=0.5")]).images[0]
+    np.testing.assert_allclose(repaired.camera.intrinsics, right.camera.intrinsics)
+    np.testing.assert_allclose(repaired.depth.camera.intrinsics, right.depth.camera.intrinsics)
 
 
 def test_scannets_mesh_is_the_cloud_where_it_is_there(tmp_path):

@@ -12,7 +12,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.e57 import unpack_e57
-from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.points import read_places, read_points
 from og_pointcloud.formats.poses import rotation_of_quaternion
 
 pye57 = pytest.importorskip("pye57")
@@ -91,6 +91,30 @@ def test_points_that_the_scanner_calls_invalid_are_left_out(tmp_path):
         file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=np.zeros(3))
     points = read_points(tmp_path / "a.e57")
     np.testing.assert_allclose(points.xyz_world[:, 0], data["cartesianX"][np.arange(300) % 3 != 0], atol=1e-6)
+
+
+class Measured(np.ndarray):
+    """An array whose bounds, which the writer stores, are those of its finite values."""
+
+    def min(self, *_, **__):
+        return float(np.nanmin(np.asarray(self)))
+
+    def max(self, *_, **__):
+        return float(np.nanmax(np.asarray(self)))
+
+
+def test_points_with_nan_are_left_out_with_a_warning_and_stay_unknown_where_labelled(tmp_path):
+    data = scan()
+    data["cartesianX"][7] = np.nan
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        measured = {name: values.view(Measured) for name, values in data.items()}
+        file.write_scan_raw(measured, rotation=np.array([1.0, 0, 0, 0]), translation=np.zeros(3))
+    with pytest.warns(UserWarning, match=r"1 of 300 points contain NaN or infinity \(the first is row 7\): left out"):
+        points = read_points(tmp_path / "a.e57")
+    np.testing.assert_allclose(points.xyz_world[:, 0], np.delete(data["cartesianX"], 7), atol=1e-6)
+    with pytest.warns(UserWarning, match="the first is row 7"):
+        places = read_places(tmp_path / "a.e57")
+    assert np.flatnonzero(np.isnan(places).any(axis=1)).tolist() == [7]
 
 
 def test_a_pinhole_image_sees_its_points_where_the_standard_says(tmp_path):

@@ -44,11 +44,21 @@ def test_map_coordinates_keep_their_millimeters(tmp_path):
 )
 @pytest.mark.parametrize(
     "values",
-    [RGB, RGB.astype("u2") * 257, RGB.astype("f4") / 255, RGB.astype("f8"), RGB.astype("i4")],
-    ids=["uchar", "ushort", "unit float", "float", "int"],
+    [RGB, RGB.astype("u2") * 257, RGB.astype("u2"), RGB.astype("f4") / 255, RGB.astype("f8"), RGB.astype("i4")],
+    ids=["uchar", "ushort", "ushort of 8 bits", "unit float", "float", "int"],
 )
 def test_colors_of_every_name_and_type(tmp_path, names, values):
     np.testing.assert_array_equal(read_points(write_cloud(tmp_path / "a.ply", **named(names, values))).rgb, RGB)
+
+
+@pytest.mark.parametrize("above", [np.nextafter(np.float32(1), np.float32(2)), 1.02, 2.0])
+def test_float_colors_a_little_above_one_are_full(tmp_path, above):
+    values = RGB.astype("f4") / 255
+    values[3, 1] = above
+    expected = RGB.copy()
+    expected[3, 1] = 255
+    rgb = read_points(write_cloud(tmp_path / "a.ply", **named(("red", "green", "blue"), values))).rgb
+    np.testing.assert_array_equal(rgb, expected)
 
 
 @pytest.mark.parametrize("bad", [-1.0, 256.0, np.nan])
@@ -151,6 +161,15 @@ def test_labelled_cloud_reads_back(tmp_path, offset, stored):
     points = read_points(path)
     np.testing.assert_allclose(points.xyz_world, XYZ + offset, rtol=0, atol=1e-6 * np.ptp(XYZ, axis=0).max())
     np.testing.assert_array_equal(points.rgb, RGB)
+
+
+def test_a_row_with_nan_makes_no_doubles_of_the_others(tmp_path):
+    xyz = XYZ.copy()
+    xyz[3] = np.nan
+    write_labelled_ply(tmp_path / "a.ply", xyz, RGB, labels_of(30))
+    rows = read_ply(tmp_path / "a.ply")["vertex"]
+    assert rows.dtype["x"] == np.float32
+    np.testing.assert_array_equal(np.isnan(rows["x"]), np.arange(30) == 3)
 
 
 def test_positions_beyond_float32_are_stored_as_double(tmp_path):

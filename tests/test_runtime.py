@@ -35,6 +35,7 @@ from og_pointcloud.ask import labelled_scene as runtime
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.scene import Points
 
 CLOUDS = tough_clouds()
 
@@ -451,6 +452,8 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
         result.save(3)
     with pytest.raises(OgPointcloudError, match=r"splats are a str; expected those that og.read_points"):
         result.save(tmp_path / "out.glb", splats="kitchen.ply")
+    with pytest.raises(OgPointcloudError, match=r"'.*out\.ply' would not keep the splats; expected .* .glb or .spz"):
+        result.save(tmp_path / "out.ply", splats=Points.from_world(scene.xyz))
 
 
 def test_what_is_printed_fits_on_a_screen(scene):

@@ -46,11 +46,12 @@ from text_models import OUT
 
 import og_pointcloud as og
 from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
+from og_pointcloud.bundle.vocabulary import add_words
 from og_pointcloud.cli import main
-from og_pointcloud.cloud import TOO_FAR
+from og_pointcloud.cloud import TOO_FAR, Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.fitting.memory import memory_in_use
-from og_pointcloud.formats.atomic import locked, replacing, replacing_folder, write_json
+from og_pointcloud.formats.atomic import changing, locked, replacing, replacing_folder, write_file, write_json
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
@@ -60,6 +61,7 @@ from og_pointcloud.formats.poses import numbered_images, read_numbers
 from og_pointcloud.formats.structure_from_motion import find_poses
 from og_pointcloud.mapping.map_journal import MAGIC, RECORD_HEADER, MapJournal, packed
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+from og_pointcloud.models import hub_cache
 from og_pointcloud.text.encoder import TextEncoder, check_templates
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -422,6 +424,38 @@ def test_a_folder_is_whole_or_not_there(tmp_path):
     assert [path.name for path in tmp_path.rglob("*")] == ["bag", "bag.mcap"]
 
 
+def test_a_folder_moved_aside_by_a_killed_run_comes_back(tmp_path):
+    (tmp_path / ".bag.1.tmp" / "bag.before").mkdir(parents=True)
+    (tmp_path / ".bag.1.tmp" / "bag.before" / "old").write_text("x")
+    with pytest.raises(ZeroDivisionError), replacing_folder(tmp_path / "bag", overwrite=True) as folder:
+        folder.mkdir(1 // 0)
+    assert [path.name for path in tmp_path.rglob("*")] == ["bag", "old"]
+
+
+def test_a_private_file_stays_private(tmp_path):
+    path = write_json(tmp_path / "a.json", {})
+    path.chmod(0o600)
+    write_json(path, {"new": 1})
+    assert (path.stat().st_mode & 0o777, json.loads(path.read_text())) == (0o600, {"new": 1})
+
+
+def test_words_added_by_two_at_once(tmp_path, monkeypatch):
+    cloud = room(500)
+    bundle, before, space = write_bundle(cloud, tmp_path / "room.ogpc"), cloud.vocabulary.names, cloud.feature_space
+    word = Vocabulary(("quince",), np.ones_like(cloud.vocabulary.vectors[:1]))
+    with changing(bundle), pytest.raises(OgPointcloudError, match="is being changed by another process"):
+        add_words(bundle, word, space)
+    assert og.load(bundle).cloud.vocabulary.names == before
+    # Replaced between opening and locking: the lock would be on a file that nobody else opens.
+    real = os.fstat
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fstat", lambda number: (write_file(bundle, bundle.read_bytes()), real(number))[1])
+        with pytest.raises(OgPointcloudError, match="is being changed by another process"):
+            add_words(bundle, word, space)
+    add_words(bundle, word, space)
+    assert og.load(bundle).cloud.vocabulary.names == (*before, "quince")
+
+
 def test_masks_twice_at_once(tiny_capture):
     (tiny_capture.folder / "mask_features.npz").unlink()
     shutil.rmtree(tiny_capture.folder / "masks")
@@ -520,6 +554,25 @@ def test_no_home(monkeypatch, bundle, capsys):
     for name in ("HF_HOME", "HF_HUB_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     assert "not among the 5 known words" in error_of(capsys, "segment", bundle, "--labels", "foo")
+
+
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [
+        ({}, "~/.cache/huggingface/hub"),
+        ({"XDG_CACHE_HOME": "/x"}, "/x/huggingface/hub"),
+        ({"XDG_CACHE_HOME": "/x", "HF_HOME": "~/hf"}, "~/hf/hub"),
+        ({"HF_HOME": "/h", "HUGGINGFACE_HUB_CACHE": "$HOME/old"}, "~/old"),
+        ({"HUGGINGFACE_HUB_CACHE": "/old", "HF_HUB_CACHE": "/new"}, "/new"),
+    ],
+)
+def test_fetched_models_lie_where_hugging_faces_tools_put_them(monkeypatch, tmp_path, variables, folder):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert hub_cache() == Path(folder.replace("~", str(tmp_path)))
 
 
 def test_no_folder_for_compiled_code(monkeypatch):

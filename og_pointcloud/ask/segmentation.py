@@ -23,6 +23,7 @@ MAX_LABELS_SHOWN = 12
 """Labels listed in a printed result."""
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """Suffixes of the files that a result can be saved as."""
+SPLATS_SAVED_AS = (".glb", ".spz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,8 @@ class Segmentation:
         .las, .laz: with colors, classification and the attributes as extra bytes (needs the extra 'las').
         .glb: colored points, or splats, with feature ids and names.
         .spz: splats in the labels' colors; the format cannot hold labels.
-        splats: the Gaussians, row by row, if the query points were Gaussians: `read_points` of their file.
+        splats: the Gaussians, row by row, if the query points were Gaussians: `read_points` of their file. Only .glb
+            and .spz keep them.
         source: the file that was labelled. From .las or .laz to .las or .laz, its point attributes and coordinate
             system are kept, and only labels are added.
         OgPointcloudError for another suffix; SceneError if the format cannot hold the points: .las and .glb cannot hold
@@ -167,6 +169,11 @@ class Segmentation:
             raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")
         if splats is not None and not isinstance(splats, Points):
             raise OgPointcloudError(f"splats are a {type(splats).__name__}; expected those that og.read_points gives")
+        if splats is not None and path.suffix not in SPLATS_SAVED_AS:
+            raise OgPointcloudError(
+                f"'{path}' would not keep the splats; expected a name that ends in {' or '.join(SPLATS_SAVED_AS)}: or "
+                "leave splats out for points with labels"
+            )
         if path.suffix == ".npz":
             self._save_arrays(path)
         elif path.suffix == ".spz":

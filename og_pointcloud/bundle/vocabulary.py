@@ -20,7 +20,7 @@ from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, MAX_NAMES_BYTES, 
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.formats.atomic import StrPath, replacing
+from og_pointcloud.formats.atomic import StrPath, changing, replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, find_encoder, read_text_encoder
@@ -96,20 +96,24 @@ def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrP
     all its words.
 
     feature_space: of the vectors. output: another file to write; None: the same one, replaced atomically.
-    FeatureSpaceError for vectors of another space or width than the file's.
+    FeatureSpaceError for vectors of another space or width than the file's; OgPointcloudError while another process
+    changes the file.
     """
-    bundle = read_bundle(path)
-    cloud = bundle.cloud
-    added = FeatureSpace(feature_space, words.vectors.shape[1])
-    cloud.space.require(added, "words")
-    old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
-    if old.names:  # if no instance has a descriptor, they alone tell the width of the space
-        FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
-    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))  # for a word in both, the later vector stays
-    vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
-    merged = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
-    counts = {**bundle.manifest["counts"], "words": len(merged.names)}
-    _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(merged))
+    with changing(path):
+        bundle = read_bundle(path)
+        cloud = bundle.cloud
+        added = FeatureSpace(feature_space, words.vectors.shape[1])
+        cloud.space.require(added, "words")
+        old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
+        if old.names:  # if no instance has a descriptor, they alone tell the width of the space
+            FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
+        vectors = dict(
+            zip(old.names, unit_rows(old.vectors), strict=True)
+        )  # for a word in both, the later vector stays
+        vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
+        merged = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
+        counts = {**bundle.manifest["counts"], "words": len(merged.names)}
+        _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(merged))
     return merged
 
 
@@ -127,9 +131,10 @@ def store_bank(path: StrPath, bank: WordBank, feature_space: str, output: StrPat
 
     feature_space, output, errors: as for ``add_words``.
     """
-    bundle = read_bundle(path)
-    bundle.cloud.space.require(FeatureSpace(feature_space, bank.vectors.shape[1]), "words of the bank")
-    _rewrite(path, output, bundle.manifest, bank_members(bank))
+    with changing(path):
+        bundle = read_bundle(path)
+        bundle.cloud.space.require(FeatureSpace(feature_space, bank.vectors.shape[1]), "words of the bank")
+        _rewrite(path, output, bundle.manifest, bank_members(bank))
 
 
 def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None) -> TextEncoder:
@@ -138,11 +143,12 @@ def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None)
     folder: written by ``og-pointcloud export text``; a file without a word bank gets the encoder's. output: as for
     ``add_words``.
     """
-    bundle = read_bundle(path)
-    members, encoder = encoder_members(folder, bundle.cloud.space)
-    if bundle.cloud.word_bank is None and encoder.word_bank is not None:
-        members |= bank_members(encoder.word_bank)
-    _rewrite(path, output, bundle.manifest, members)
+    with changing(path):
+        bundle = read_bundle(path)
+        members, encoder = encoder_members(folder, bundle.cloud.space)
+        if bundle.cloud.word_bank is None and encoder.word_bank is not None:
+            members |= bank_members(encoder.word_bank)
+        _rewrite(path, output, bundle.manifest, members)
     return encoder
 
 

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
 
@@ -52,6 +52,8 @@ def replacing(path: StrPath, *, durable: bool = True) -> Iterator[BinaryIO]:
                 file.flush()
                 if durable:
                     os.fsync(file.fileno())
+        if path.exists():
+            shutil.copymode(path, temporary)  # a private file stays private
         os.replace(temporary, path)  # atomic: readers find the old file or the new one, whole
         if durable:
             _sync_folder(path.parent)
@@ -86,6 +88,8 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         if old.is_dir() and not old.is_symlink():
             with suppress(OgPointcloudError), locked(old):
+                if (before := old / f"{path.name}.before").exists() and not path.exists():
+                    before.rename(path)  # killed after moving the old folder aside
                 shutil.rmtree(old, ignore_errors=True)
     temporary = _temporary(path)
     temporary.mkdir()
@@ -102,6 +106,20 @@ def replacing_folder(path: StrPath, *, overwrite: bool = False) -> Iterator[Path
                 raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def changing(path: StrPath) -> Iterator[None]:
+    """Keep other processes from changing a file that is read and then replaced; OgPointcloudError if one is at it."""
+    with ExitStack() as stack:
+        with suppress(OSError):  # the reader says why a file cannot be read
+            file = stack.enter_context(Path(path).open("rb"))
+            # A file that was replaced since it was opened is no longer the one that others lock.
+            if not _hold(file) or not os.path.samestat(os.fstat(file.fileno()), os.stat(path)):
+                raise OgPointcloudError(
+                    f"'{path}' is being changed by another process; expected one at a time: run this again afterwards"
+                )
+        yield
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import MAX_NUMBER, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import DoubleArray, Points
+from og_pointcloud.scene import DoubleArray
 
 E57_SIGNATURE = b"ASTM-E57"
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -41,8 +41,9 @@ SPHERICAL_FROM_OPENGL = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
 
-def read_e57(path: StrPath) -> Points:
-    """All scans of an E57 file in its world; points that the scanner marks as invalid are left out.
+def read_e57(path: StrPath) -> NDArray[np.void]:
+    """Rows x, y, z and, if all scans have colors, red, green, blue of all scans of an E57 file in its world; points
+    that the scanner marks as invalid are left out.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without pye57.
     """
@@ -58,7 +59,7 @@ def read_e57(path: StrPath) -> Points:
         xyz = np.concatenate([xyz for xyz, _ in parts])
         colors = [rgb for _, rgb in parts if rgb is not None]
         rgb = np.concatenate(colors) if len(colors) == len(parts) else None
-        return Points.from_world(xyz, rgb=rgb)
+        return plain_rows(xyz, rgb)
 
 
 def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
@@ -71,7 +72,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
         raise SceneError(
             f"{folder / 'images'} is a link, and nothing is written through links; expected a folder: remove it"
         )
-    points = read_e57(path)
+    rows = read_e57(path)
     frames, unused = [], []
     with _opened(path) as (_, file):
         for number, image in enumerate(_children(file.root(), "images2D")):
@@ -83,7 +84,7 @@ def unpack_e57(path: StrPath, folder: StrPath) -> tuple[int, list[str]]:
         if not frames:
             why = unused[0] if unused else "the file has no images"
             raise SceneError(f"none of its images can be used ({why}); expected pinhole or spherical ones with poses")
-    write_ply(folder / "points.ply", {"vertex": plain_rows(points.xyz_world, points.rgb)})
+    write_ply(folder / "points.ply", {"vertex": rows})
     write_json(folder / "transforms.json", {"ply_file_path": "points.ply", "frames": frames})
     return len(frames), unused
 

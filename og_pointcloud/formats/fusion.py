@@ -95,7 +95,7 @@ class FusedCloud:
 
 
 def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
-    """Fuse posed depth images; each is read twice, so that memory holds one at a time.
+    """Fuse posed depth images; each is read several times, so that memory holds one at a time.
 
     Raises SceneError where no frame measures anything, or a file cannot be read.
     """

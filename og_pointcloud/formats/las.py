@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import StrPath, replacing
-from og_pointcloud.formats.tables import LABEL_FINITE, naming
+from og_pointcloud.formats.tables import LABEL_FINITE, SCALE_8_TO_16_BITS, naming
 from og_pointcloud.scene import DoubleArray, Points, require_finite
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ FIRST_FREE_CLASS, LAST_CLASS = 64, 255
 """Classes that the format leaves to its users: label k is class 64 + k."""
 STEPS_PER_EXTENT = 1e8
 """Coordinates are stored as 32-bit multiples of a step: ten nanometers in a room, 10 micrometers in a city block."""
-SCALE_8_TO_16_BITS = 257
-"""Scales an 8-bit color to the range of 16 bits."""
 EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 """Point formats before LAS 1.4 have only 32 classes: each is mapped to the later format that has all its fields."""
 DEGREES_PER_STEP = 0.006

@@ -73,7 +73,7 @@ def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_
 
 
 def _read(path: Path) -> Points | NDArray[np.void]:
-    """A file's points; for a plain cloud in PLY or PCD, its rows as they are."""
+    """A file's points; for a plain cloud in PLY, PCD or E57, its rows as they are."""
     if path.exists() and not (path.is_file() or path.is_dir()):  # such a file cannot be read twice
         raise SceneError("it is a pipe or a device; expected a file: write the cloud to one first")
     with path.open("rb") as file:

@@ -49,6 +49,8 @@ from og_pointcloud.scene import Camera, DoubleArray, IntArray
 
 REPAIRS_NAME = "repairs.json"
 MAX_REPAIRS = 16
+SAME_LENS_TOLERANCE = 0.01
+"""Depth images whose intrinsics, scaled, are the photographs' within this relative tolerance share their mistakes."""
 OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MASK_FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "mirrored": lambda ids: ids[:, ::-1],
@@ -139,14 +141,20 @@ def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> li
 
 
 def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
-    """The images after these repairs. Depth images move and scale with their photographs."""
+    """The images after these repairs. Depth images move with their photographs, and scale with them unless they are of
+    a sensor with intrinsics of its own."""
     cameras = repaired_cameras([image.camera for image in images], repairs)
     # All images have an entry, so that repairs of all cameras together shift depth images as they shift photographs.
     depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
     without_lens = {"lens": None} if any(repair.name == "lens" for repair in repairs) else {}
     repaired = []
     for image, camera, depth_camera in zip(images, cameras, depths, strict=True):
-        depth = image.depth and replace(image.depth, camera=depth_camera, **without_lens)
+        depth = image.depth
+        if depth is not None:
+            as_photograph = depth.camera.resized(image.camera.width, image.camera.height).intrinsics
+            if not np.allclose(as_photograph, image.camera.intrinsics, rtol=SAME_LENS_TOLERANCE):
+                depth_camera = replace(depth.camera, world_to_camera=depth_camera.world_to_camera)
+            depth = replace(depth, camera=depth_camera, **without_lens)
         repaired.append(replace(image, camera=camera, depth=depth, **without_lens))
     return tuple(repaired)
 

@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
+SCALE_8_TO_16_BITS = 257
+"""Scales an 8-bit color to the range of 16 bits."""
+MAX_FRACTION = 2.0
+"""Float colors up to this are in 0..1, some a little above by rounding or sharpening; on 0..255 all would be black."""
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 LABEL_FINITE = "save as .ply or .npz, which can store them, or label only points[np.isfinite(points).all(axis=1)]"
 """The cure if a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
@@ -110,8 +114,8 @@ def positions(rows: NDArray[np.void]) -> NDArray[np.float64]:
 def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     """(n, 3) uint8 RGB, or None without color columns.
 
-    Takes uint8; uint16 (full range); other numbers in 0..1 or 0..255, told apart by their maximum; and PCL's packed
-    ``rgb``/``rgba``, 0xAARRGGBB in four bytes, also if the file declares these bytes a float.
+    Takes uint8; uint16 (full range, or 0..255); other numbers in 0..1 or 0..255; and PCL's packed ``rgb``/``rgba``,
+    0xAARRGGBB in four bytes, also if the file declares these bytes a float.
     """
     packed = _first_present(rows, tuple((name,) for name in PACKED_COLOR_COLUMNS))
     if packed and rows.dtype[packed[0]].itemsize == 4:
@@ -127,13 +131,13 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     values = stack_columns(rows, names)
     low, high = values.min(initial=0.0), values.max(initial=0.0)
     if types == {np.dtype(np.uint16)}:
-        values /= 257.0  # 65535 / 255
+        values /= 1 if high <= 255 else SCALE_8_TO_16_BITS
     elif not (low >= 0 and high <= 255):
         raise SceneError(
             f"colors {', '.join(names)} span {low:.6g}..{high:.6g}; expected 0..1 or 0..255: rescale or drop them"
         )
-    elif high <= 1 and rows.dtype[names[0]].kind == "f":
-        values *= 255.0
+    elif high <= MAX_FRACTION and rows.dtype[names[0]].kind == "f":
+        values = 255 * np.minimum(values, 1)
     return np.rint(values).astype(np.uint8)
 
 
@@ -145,8 +149,10 @@ def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:
     if len(world) == 0:
         return single
     with np.errstate(invalid="ignore", over="ignore"):
-        loss = np.abs(single.astype(np.float64) - world).max()
-        extent = np.ptp(world, axis=0).max()
+        # Not a number, as a depth camera marks what it did not measure, is the same in both.
+        placed = np.isfinite(world).all(axis=1)
+        loss = np.abs(single[placed].astype(np.float64) - world[placed]).max(initial=0)
+        extent = np.ptp(world[placed], axis=0).max() if placed.any() else 0.0
     return single if loss <= 1e-6 * extent else world
 
 
