@@ -5,6 +5,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from og_pointcloud.formats.colors import label_colors
 pv = pytest.importorskip("pyvista")
 
 from og_pointcloud_pyvista import can_render, to_pyvista  # noqa: E402
+from og_pointcloud_pyvista.datasets import box_lines  # noqa: E402
 from og_pointcloud_pyvista.plotting import HIGHLIGHT, UNKNOWN_COLOR  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -188,6 +190,40 @@ def test_boxes_are_the_instances_own(scene, monkeypatch):
     assert pv.PolyData(scene.xyz + 50).og.boxes(scene).n_cells == 0
 
 
+def test_ids_of_one_scene_are_not_read_as_those_of_another(bundle, tmp_path):
+    cloud = room()
+    ids = np.where(cloud.instance_ids >= 0, (cloud.instance_ids + 3) % len(cloud.instances), cloud.instance_ids)
+    other = write_bundle(replace(cloud, instance_ids=ids), tmp_path / "other.ogpc")
+    expected = pv.PolyData(og.load(other).xyz).og.select("plum", other)
+    boxes = box_lines(og.instance_table(other))
+    for mesh in (pv.read(bundle), pv.read(bundle).og.segment(["plum", "apple"])):
+        ids = mesh["og_instance"].copy()
+        assert np.array_equal(mesh.og.select("plum", other).points, expected.points)
+        assert np.array_equal(mesh.og.boxes(other)["og_instance"], boxes["og_instance"]), "none is left out"
+        assert np.array_equal(mesh.og.boxes(other)["og_color"], boxes["og_color"]), "the labels are another scene's"
+        assert np.array_equal(mesh["og_instance"], ids)
+    in_memory = og.LabelledScene.from_cloud(og.load(other).cloud)
+    assert np.array_equal(pv.read(bundle).og.select("plum", in_memory).points, expected.points)
+
+
+IN_WORLD = r"segmented with a pose; expected points in the scene's world .*mesh\.transform\(mesh"
+POSE = np.array([[1.0, 0, 0, 10], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def test_a_dataset_that_is_not_in_world_coordinates_gets_no_boxes_there(scene, bundle):
+    mesh = pv.PolyData(scene.xyz - POSE[:3, 3]).og.segment(["plum"], bundle, pose=POSE)
+    assert mesh.og.select("plum").n_points > 0, "by the ids that it has"
+    for query in (mesh.og.boxes, partial(mesh.og.select, "plum", og.LabelledScene.from_cloud(scene.cloud))):
+        with pytest.raises(og.OgPointcloudError, match=IN_WORLD):
+            query()
+    moved = mesh.transform(mesh.field_data["og_pose"], inplace=False).og.segment(["plum"], bundle)
+    expected = pv.PolyData(scene.xyz).og.segment(["plum"], bundle).og.boxes()
+    assert np.allclose(moved.og.boxes().points, expected.points)
+    assert mesh.og.segment(["plum"], bundle, pose=POSE).n_points == mesh.n_points
+    unmoved = pv.PolyData(scene.xyz).og.segment(["plum"], bundle, pose=np.eye(4))
+    assert np.allclose(unmoved.og.boxes().points, expected.points)
+
+
 def test_a_scene_is_read(bundle, tmp_path):
     mesh, scene = pv.read(bundle), og.load(bundle)
     assert np.array_equal(mesh.points, scene.xyz)
@@ -300,6 +336,12 @@ def test_a_click_asks_the_scene_drawn_last(plotter, bundle):
     plotter.og.enable_click_query()
     row = int(np.argmax(mesh["og_instance"] >= 0))
     assert plotter.og.query(mesh.points[row]).instance == mesh["og_instance"][row]
+
+
+def test_clicks_on_a_dataset_that_is_not_in_world_coordinates_are_refused(plotter, scene, bundle):
+    plotter.og.add_segmentation(pv.PolyData(scene.xyz - POSE[:3, 3]).og.segment(["plum"], bundle, pose=POSE))
+    with pytest.raises(og.OgPointcloudError, match=IN_WORLD):
+        plotter.og.enable_click_query()
 
 
 def test_a_scene_without_words_still_answers_clicks(plotter, tmp_path):

@@ -1,7 +1,8 @@
 """What ``mesh.og`` does: labels as point arrays, points selected by words, boxes of instances as lines.
 
 Point arrays: og_label (int32, row of og_names, -1 unknown), og_instance (int32, the scene's id, negative for none),
-og_score (float32), og_reason (uint8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
+og_score (float32), og_reason (uint8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, the scene's file, and
+og_pose, the pose to the scene's world of a dataset that was segmented with one.
 Labels belong to points. For labels of cells, by majority of their points, call
 ``mesh.point_data_to_cell_data(categorical=True)``.
 """
@@ -26,6 +27,7 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
+POSE_FIELD = "og_pose"
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 """Pairs of indices into `Box.corners`: the two ends of an edge differ in one bit, that is one axis."""
 
@@ -58,6 +60,10 @@ class OgDataSet:
         result = og.segment(self._mesh, labels, scene, pose=pose, **options)
         mesh = self._mesh.copy()
         _attach(mesh, result)
+        if POSE_FIELD in mesh.field_data:  # left from an earlier answer
+            mesh.field_data.remove(POSE_FIELD)
+        if pose is not None and not np.array_equal(np.asarray(pose), np.eye(4)):
+            mesh.field_data[POSE_FIELD] = np.asarray(pose, np.float64)
         return mesh
 
     def select(
@@ -75,7 +81,7 @@ class OgDataSet:
         """
         found = find_scene(self._mesh, scene)
         selection = og.select(found, text, against=against, text_features=text_features)
-        mesh = self._with_instances(found)
+        mesh = self._with_instances(found, scene)
         if not (mesh.n_points and np.isin(mesh.point_data[INSTANCE], selection.instances).any()):
             warnings.warn(f"no point of this dataset is selected: {selection}", stacklevel=2)
             return pv.UnstructuredGrid()
@@ -89,28 +95,44 @@ class OgDataSet:
     def boxes(self, scene: SceneLike | None = None, *, up: ArrayLike | None = None) -> pv.PolyData:
         """Oriented boxes of the scene's instances that have points here, as lines: 12 cells each.
 
-        For a segmented dataset, only labelled instances, in their label's color. Cell arrays: og_instance, og_color.
-        up: (3,) vertical axis of the boxes, if known.
+        For a dataset that this scene segmented, only labelled instances, in their label's color. Cell arrays:
+        og_instance, og_color. up: (3,) vertical axis of the boxes, if known.
         """
         found = find_scene(self._mesh, scene)
-        mesh = self._with_instances(found)
+        check_in_world(self._mesh)
+        mesh = self._with_instances(found, scene)
         if not mesh.n_points:
             return pv.PolyData()
-        segmented = LABEL in mesh.point_data
+        segmented = mesh is self._mesh and LABEL in mesh.point_data
         included = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
         ids = [instance for instance in np.unique(mesh.point_data[INSTANCE][included]).tolist() if instance >= 0]
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
         table = og.instance_table(found, up=up)
         return box_lines([table[instance] for instance in ids], colors)
 
-    def _with_instances(self, scene: LabelledScene) -> Any:
-        """This dataset or, if it has no instance ids, a shallow copy with the scene's."""
-        if INSTANCE in self._mesh.point_data:
+    def _with_instances(self, scene: LabelledScene, given: SceneLike | None) -> Any:
+        """This dataset if its instance ids are this scene's, else a shallow copy with the scene's.
+
+        given: the scene that the caller passed; None where the dataset names it.
+        """
+        named = np.asarray(self._mesh.field_data.get(SCENE_FIELD, ())).ravel()
+        is_own = given is None or not len(named) or (scene.path is not None and named[0] == scene_name(scene.path))
+        if INSTANCE in self._mesh.point_data and is_own:
             return self._mesh
+        check_in_world(self._mesh)
         mesh = self._mesh.copy(deep=False)
         if mesh.n_points:
             mesh.point_data[INSTANCE] = scene.instances_at(np.asarray(self._mesh.points))
         return mesh
+
+
+def check_in_world(mesh: pv.DataSet) -> None:
+    """OgPointcloudError for a dataset that was segmented with a pose, and so is not in the scene's coordinates."""
+    if POSE_FIELD in mesh.field_data:
+        raise OgPointcloudError(
+            f"this {type(mesh).__name__} was segmented with a pose; expected points in the scene's world coordinates: "
+            f"mesh.transform(mesh.field_data['{POSE_FIELD}'], inplace=False).og.segment(labels, scene)"
+        )
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 from og_pointcloud.text.words import Labels
-from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, box_lines, label_names
+from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, box_lines, check_in_world, label_names
 from og_pointcloud_pyvista.files import RGB
 
 UNKNOWN_COLOR = (205, 205, 205)
@@ -51,13 +51,14 @@ class OgPlotter:
     def __init__(self, plotter: pv.Plotter) -> None:
         self._plotter: Any = plotter
         self._scene: LabelledScene | None = None
+        self._drawn: pv.DataSet | None = None
         self._point_size = 5.0
         self._labels: Labels = None
         self._count = 5
         self._on_click: Callable[[Pick], None] | None = None
 
     def __plotter_close__(self) -> None:
-        self._scene, self._on_click = None, None
+        self._scene, self._drawn, self._on_click = None, None, None
 
     def add_segmentation(
         self,
@@ -80,7 +81,7 @@ class OgPlotter:
         """
         if by not in ("label", "instance"):
             raise OgPointcloudError(f"by is {by!r:.40}; expected 'label' or 'instance'")
-        mesh = _drawable(mesh)
+        self._drawn, mesh = mesh, _drawable(mesh)
         words = label_names(mesh)
         labels = np.asarray(mesh.point_data[LABEL])
         if (labels < 0).all():
@@ -149,6 +150,8 @@ class OgPlotter:
         rank; None: the scene's own. words: number of words shown.
         callback: called with each ``Pick``, even if it hit no instance. options: of ``enable_point_picking``.
         """
+        if self._drawn is not None:
+            check_in_world(self._drawn)
         self._scene = find_scene(None, scene if scene is not None else self._scene)
         self._labels, self._count = labels, words
         self._on_click = callback
