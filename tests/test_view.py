@@ -88,6 +88,35 @@ def test_what_is_gone_is_no_instance_of_a_page(tmp_path):
     assert content(tmp_path / "p.html")["subtitle"].endswith(f" {len(cloud.instances) - 1} instances")
 
 
+def test_why_an_instance_has_no_words_is_said(tmp_path):
+    cloud, page, view = room(300), tmp_path / "page.html", Viewpoint(np.ones(3), np.zeros(3), Z_UP)
+    for known, note in ((cloud, "cosine: how similar"), (replace(cloud, vocabulary=None), "the scene stores no words")):
+        scene = og.LabelledScene.from_cloud(known)
+        labels = {"nothing": -cloud.instances.descriptors.sum(axis=0)}
+        write_page(page, scene, og.segment(scene, labels), view, Look("room"))
+        notes = [row["note"] for row in content(page)["instances"]]
+        assert notes[4].startswith("no mask gave it a feature"), "it has no descriptor"
+        assert all(each.startswith(note) for each in notes[:4] + notes[5:])
+    assert page.read_text(encoding="utf-8").count("row.note") == 1
+
+
+def test_the_up_button_starts_at_the_axis_nearest_to_up(bundle, tmp_path):
+    if (node := shutil.which("node")) is None:
+        pytest.skip("no node here to run the page's script")
+    scene = og.load(bundle)
+    view = Viewpoint(np.ones(3), np.zeros(3), np.array([0.02, -0.1, 0.99]))
+    write_page(tmp_path / "page.html", scene, og.segment(scene), view, Look("room"))
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if re.search(r'const (steepest|axis) = |\$\("up"\)\.onclick', line)]
+    up = content(tmp_path / "page.html")["up"]
+    script = f"let up = {up}; const button = {{}}, $ = () => button, draw = () => {{}}\n" + "\n".join(
+        [*sorted(lines, key=lambda line: "onclick" in line), "axis(); console.log(button.textContent)"]
+        + ["button.onclick(); console.log(button.textContent, String(up))"] * 2
+    )
+    done = subprocess.run([node, "-e", script], capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines() == ["up: z", "up: -z 0,0,-1", "up: x 1,0,0"], done.stderr
+
+
 def test_names_cannot_break_out_of_the_page(tmp_path):
     name = "</script><script>alert(1)</script><!--"
     cloud = room(300)

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.instances import NO_FEATURE, Instances
+from og_pointcloud.ask.instances import NO_FEATURE, Instance, Instances
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
@@ -205,10 +205,7 @@ class LiveScene:
         if row.oriented_box is not None and row.centroid is not None:
             size = " x ".join(f"{length:.3g}" for length in row.oriented_box.size)
             lines.append(f"size {size} · at {', '.join(map(coordinate, row.centroid))}")
-        if row.state == NO_FEATURE:
-            note = "no mask gave it a feature: it is unknown for every word"
-        else:
-            note = meaning(self.scene.chooser.bank is not None) if row.words else "the scene stores no words to name it"
+        note = meaning_of(row, self.scene.chooser.bank is not None)
         title = self.names[self.label_of[instance]] if self.label_of[instance] >= 0 else "unknown"
         return Answer(title, tuple(lines), row.words, note)
 
@@ -248,6 +245,13 @@ def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
     )
     change[list(record.moved_from)] = names.index("moved to here")
     return change
+
+
+def meaning_of(row: Instance, calibrated: bool) -> str:
+    """What an instance's scores are, or why it has none."""
+    if row.state == NO_FEATURE:
+        return "no mask gave it a feature: it is unknown for every word"
+    return meaning(calibrated) if row.words else "the scene stores no words to name it"
 
 
 def meaning(calibrated: bool) -> str:

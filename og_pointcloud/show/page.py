@@ -23,7 +23,7 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
-from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning
+from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning, meaning_of
 from og_pointcloud.show.viewpoint import Viewpoint
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -131,7 +131,7 @@ def _instances(
         label, points = shown.get(row.id, (-1, 0))
         record: dict[str, Any] = {
             "id": row.id, "label": label, "points": points, "views": row.views, "words": row.words,
-            "choice": int(choice[row.id]),
+            "choice": int(choice[row.id]), "note": meaning_of(row, result.calibrated),
         }  # fmt: skip
         if points and row.oriented_box is not None and row.centroid is not None:
             record |= {
