@@ -235,6 +235,24 @@ def test_bad_use_is_one_line(arguments, text, capsys):
     assert text in error_of(capsys, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("option", "positionals"),
+    [
+        ("--only", ("repair", "cap", "axes=flipped")), ("--only", ("repair", "cap", "axes=flipped", "world=x,z,-y")),
+        ("-o=t.ogpc", ("vocabulary add", "s.ogpc", "words.txt")),
+        ("-o=t.ogpc", ("vocabulary bank", "s.ogpc", "bank.npz")),
+    ],
+)  # fmt: skip
+def test_options_stand_anywhere_among_positionals(option, positionals):
+    lines = [[*positionals[:at], option, *positionals[at:]] for at in range(1, len(positionals) + 1)]
+    for line in lines:
+        arguments, unknown = build_parser().parse_known_args(" ".join(line).replace("=t", " t").split())
+        assert not unknown
+        given = {str(value) for value in vars(arguments).values()} | {*vars(arguments).get("repairs", ())}
+        assert {*positionals[1:]} <= given
+        assert "True" in given or "t.ogpc" in given
+
+
 def test_inputs_are_not_overwritten(tiny_capture, capsys):
     folder = tiny_capture.folder
     before = (folder / "transforms.json").read_bytes()

@@ -214,6 +214,7 @@ def test_the_command_stores_a_bank_of_text_features(path, tmp_path, capsys):
         ((tmp_path / "few.npz",), "few.npz: a word bank of 49 words; expected at least 50"),
         ((tmp_path / "other.npz",), "words of the bank are in feature space 'other'"),
         ((), f"export text MODEL_FOLDER --feature-space {SPACE}"),
+        ((tmp_path / "f.npz", "--text-encoder", tmp_path), "from one source: F.npz, or --text-encoder DIR"),
     ):
         assert says in error_of(capsys, "vocabulary", "bank", path, *arguments)
     assert path.read_bytes() == before

@@ -41,6 +41,18 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
         self.register("action", None, Once)
         self._negative_number_matcher = re.compile(r"-([\d.,][\d.,eE+-]*|[xyz])$")  # -1,2e-5,3 and -z are values
+        self._is_intermixing = False
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore
+        """Options may stand before an optional positional, where argparse alone would give it nothing."""
+        is_plain = all(action.nargs not in ("?", "*") for action in self._get_positional_actions())
+        if is_plain or self._is_intermixing:
+            return super().parse_known_args(args, namespace)
+        self._is_intermixing = True  # argparse calls this method, once for the options and once for the positionals
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._is_intermixing = False
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} (see '{self.prog} --help')\n")

@@ -22,11 +22,11 @@ def add(parser: Parser) -> None:
     for action in (add, bank, carry):
         add_option(action, "bundle", "S.ogpc", "file that `fit` wrote", type=replaceable)
         add_output(action, "-o", "--output", endings=(".ogpc",), help="file to write (default: S.ogpc itself)")
-    sources = add.add_mutually_exclusive_group(), bank.add_mutually_exclusive_group()
+    sources = add.add_mutually_exclusive_group()
     add_option(add, "words", "words.txt", "text file, one word per line", type=Path, nargs="?")
-    add_option(sources[0], "--text-features", "F.npz", "or names with their vectors", type=Path)
-    add_option(sources[1], "features", "F.npz", "vectors of at least 50 everyday words", type=Path, nargs="?")
-    for source in sources:
+    add_option(sources, "--text-features", "F.npz", "or names with their vectors", type=Path)
+    add_option(bank, "features", "F.npz", "vectors of at least 50 everyday words", type=Path, nargs="?")
+    for source in (sources, bank):
         add_option(source, "--text-encoder", "DIR", "text encoder (default: the feature space's, if found)", type=Path)
     add_option(carry, "encoder", "DIR", "folder that `og-pointcloud export text` wrote", type=Path)
 
@@ -71,6 +71,8 @@ def run_bank(arguments: argparse.Namespace) -> None:
     """
     from og_pointcloud.bundle.vocabulary import read_bank, store_bank
 
+    if arguments.features and arguments.text_encoder:
+        arguments.parser.error("expected everyday words from one source: F.npz, or --text-encoder DIR")
     if arguments.features:
         bank, space = read_bank(arguments.features)
     else:
