@@ -42,6 +42,18 @@ def test_a_word_that_the_truth_lacks_is_a_wrong_answer():
         truth.score(labels[:-1])
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint32, np.uint64])
+def test_classes_may_be_unsigned(tmp_path, kind):
+    cls = np.arange(60) // 30
+    np.savez(tmp_path / "gt.npz", cls=cls.astype(kind), names=np.array(["cup", "pot"]), instance=cls.astype(kind))
+    truth = read_truth(tmp_path)
+    assert (truth.cls - 2).min() == (truth.instance - 2).min() == -2, "below 0 is none: unsigned numbers have no such"
+    assert truth.score(truth.class_of(cls, ("cup", "pot"))).miou == 1
+    np.savez(tmp_path / "gt.npz", cls=(cls + 1).astype(kind), names=np.array(["cup", "pot"]))
+    with pytest.raises(SceneError, match=r"up to 2, names .* expected whole numbers"):
+        read_truth(tmp_path)
+
+
 def test_instances_of_the_truth_are_read_and_checked(tmp_path):
     entries = {"cls": np.array([0, 1]), "names": np.array(NAMES)}
     np.savez(tmp_path / "gt.npz", **entries)

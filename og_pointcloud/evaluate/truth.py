@@ -67,17 +67,22 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
         )
     entries = read_npz(path, ("cls", "names"), POINT_ARRAYS, MAX_UNPACKED_BYTES, "'cls' (n,) and 'names' (L,)")
     cls, names = entries["cls"], entries["names"]
-    if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
+    is_listed = cls.ndim == 1 and cls.dtype.kind in "iu" and names.ndim == 1 and names.dtype.kind == "U"
+    highest = int(cls.max()) if is_listed and cls.size else -1
+    if not is_listed or highest >= len(names):
+        reach = f" up to {highest}" if is_listed else ""
         raise SceneError(
-            f"{path}: cls is {cls.dtype} {cls.shape} up to {cls.max(initial=-1)}, names {names.dtype} {names.shape}; "
-            "expected whole numbers (n,) that index the names, and strings (L,)"
+            f"{path}: cls is {cls.dtype} {cls.shape}{reach}, names {names.dtype} {names.shape}; expected whole "
+            "numbers (n,) that index the names, and strings (L,)"
         )
+    cls = cls.astype(np.int64)  # of unsigned numbers, -1 is not one
     for name in POINT_ARRAYS:
         if name in entries and entries[name].shape != cls.shape:
             raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one per point")
     instance = entries.get("instance")
     if instance is not None and instance.dtype.kind not in "iu":
         raise SceneError(f"{path}: instance is {instance.dtype}; expected whole numbers, below 0 for none")
+    instance = None if instance is None else instance.astype(np.int64)
     scored = np.ones(len(cls), bool)
     # A file may state how each point got its class: by votes of labelled images, which may be few or divided.
     if "views" in entries:
