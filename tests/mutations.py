@@ -258,7 +258,7 @@ MUTATIONS = (
     ),
     Mutation(
         "crumbs make masks span", "fitting/grouping.py",
-        "held > settings.spanning_share * total", "held > 0", ("test_grouping.py",),
+        "held.data > settings.spanning_share * total[mask]", "held.data > 0", ("test_grouping.py",),
     ),
     Mutation(
         "masks that span objects take part", "fitting/grouping.py",

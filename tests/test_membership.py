@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -139,6 +140,22 @@ def test_a_group_of_which_no_point_is_sure_is_dismissed() -> None:
     result = decide(hand_table(N, views), [0] * 4 + [1, 0])
     assert result.dismissed.tolist() == [False, True]
     assert result.instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_a_part_of_a_scene_without_a_sure_point_of_a_thing_is_decided_as_in_the_scene() -> None:
+    """Far from the points that views agree on, one view of two that see the thing has it in a mask."""
+    n, thing, doubtful = 1000, range(840), range(640, 840)
+    views = [[(thing, ONE)], [(range(40), ONE)], [(range(640), ONE)]]
+    table = hand_table(n, views, [(), (), doubtful])
+    around = partial(neighborhood, settings=GeometrySettings())
+    whole = assign_points(table, view_votes(table), groups([0, 0, 0]), around(on_a_line(n)), SETTINGS)
+    part = np.arange(740, n)
+    of_part, alone = table.of_points(part), replace(SETTINGS, rate_share=0.0, missed_chance=0.0)
+    decided = assign_points(
+        of_part, view_votes(of_part), groups([0, 0, 0]), around(on_a_line(n)[part]), alone, None, whole.scene
+    )
+    assert (whole.instance_ids[740:800] == 0).all()
+    np.testing.assert_array_equal(decided.instance_ids[:60], whole.instance_ids[740:800])
 
 
 @pytest.mark.parametrize("numbers", [[], [-1, -1]])

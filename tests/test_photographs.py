@@ -145,6 +145,19 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
     np.testing.assert_array_equal(joined.mask_features, features[[part[0] for part in parts]])
 
 
+def test_what_several_faces_show_is_summed_where_matrices_share_their_columns():
+    """As those of exposure and doubts do: faces come one after the other, and a point on their border is in both."""
+    views = [made_view(f"p/{face}", 0, "p", []) for face in range(2)]
+    columns, starts = np.array([0, 1, 2, 2, 3, 4], np.int32), np.array([0, 3, 6], np.int32)
+    doubts = np.array([0.1, 0.2, 0.3, 0.3, 0.4, 0.5], np.float32)
+    exposure, doubted = (csr_array((of, columns, starts), shape=(2, 5)) for of in (np.full(6, 0.4, np.float32), doubts))
+    empty, no_masks = csr_array((0, 5), dtype=np.float32), np.zeros(0, np.int32)
+    table = MaskTable(empty, exposure.copy(), exposure, no_masks, no_masks, np.zeros((0, 3), np.float32))
+    joined = Photographs.of(views).joined(replace(table, doubted=doubted))
+    np.testing.assert_allclose(joined.exposure.toarray(), [[0.4, 0.4, 0.8, 0.4, 0.4]])
+    np.testing.assert_allclose(joined.doubted.toarray(), [[0.1, 0.2, 0.6, 0.4, 0.5]])
+
+
 def made_view(name: str, count: int, photograph: str | None, rows: list[int]) -> View:
     camera = og.Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
     cut_from = None if photograph is None else CutMasks(photograph, np.array(rows, np.int64))

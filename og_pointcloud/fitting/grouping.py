@@ -82,11 +82,13 @@ def with_spanning(
     (n,) int32, the group of each point as decided so far, below 0 none.
     """
     of_group = indicator(ids, groups.count).T
-    held = (votes.in_mask @ of_group).toarray()  # (masks, groups)
-    shown = (votes.vote @ of_group).toarray()[mask_view]
-    total = np.asarray(votes.in_mask.sum(axis=1), np.float64).reshape(-1, 1)
-    spans = (held > settings.container_share * shown) & (held > settings.spanning_share * total)
-    return replace(groups, spanning=groups.spanning | ((spans.sum(axis=1) > 1) & (groups.group >= 0)))
+    held = (votes.in_mask @ of_group).tocoo()  # (masks, groups)
+    mask, group = held.row, held.col
+    shown = (votes.vote @ of_group).toarray()[mask_view[mask], group]
+    total = np.asarray(votes.in_mask.sum(axis=1), np.float64)
+    spans = (held.data > settings.container_share * shown) & (held.data > settings.spanning_share * total[mask])
+    several = np.bincount(mask[spans], minlength=len(total)) > 1
+    return replace(groups, spanning=groups.spanning | (several & (groups.group >= 0)))
 
 
 def mask_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, NDArray[np.bool_]]:
@@ -241,7 +243,7 @@ def _agglomerate(
     kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
     links = np.searchsorted(w.rows[kept], numbers), w.cols[kept].astype(np.int64), w.agree[kept], w.same_extent[kept]
     group, total = np.where(usable, numbers[:-1], -1), features.astype(np.float64)
-    sums = w.left.copy(), w.right.copy(), total, features.any(axis=1).astype(np.float64)
+    sums = w.left, w.right, total, features.any(axis=1).astype(np.float64)  # of the witnesses, who are needed no more
     _merge_groups(group, links, sums, cosines_within_views(features, mask_view), settings.join_majority)
     return _roots(group)
 

@@ -85,6 +85,8 @@ def edge_contrast(view: View) -> NDArray[np.float64] | None:
         return None
     cv2, stride = require_cv2(), _stride(view)
     ids = view.mask_map()[::stride, ::stride]
+    if min(ids.shape) < 2:
+        return None
     inside, outside = ids >= 0, ids == -1
     if not inside.any() or not outside.any():
         return None

@@ -57,10 +57,11 @@ from og_pointcloud.settings import FitSettings, MembershipSettings
 @dataclass(frozen=True)
 class SceneVotes:
     """What all votes of a scene say, for deciding some of its points. typical_openness: see `ViewVotes`. reports: what
-    each view reports of each state."""
+    each view reports of each state. kept: (groups,) bool, those with sure points that the views do not contradict."""
 
     typical_openness: float
     reports: ViewReports
+    kept: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,8 @@ def assign_points(
     visibility = _visibility(votes.openness, settings.open_share * typical)
     clear = _clear(support, visibility, settings)
     dismissed |= _noise_of_one_view(p_missed, support, clear, around, rgb, settings.missed_chance)
+    if scene:  # a thing may have no sure point in this part of the scene
+        dismissed &= ~scene.kept
     if dismissed.any():
         support = _support(*inputs, ~dismissed, settings)
         clear = _clear(support, visibility, settings)
@@ -137,7 +140,7 @@ def assign_points(
     certainty = likely.probability_of(ids) * _neighbor_agreement(ids, around.index, around.adjoining)
     return Membership(
         ids, certainty.astype(np.float32), likely.expected_iou(ids), rate.astype(np.float32), dismissed,
-        SceneVotes(typical, reports),
+        SceneVotes(typical, reports, ~dismissed),
     )  # fmt: skip
 
 
@@ -444,20 +447,20 @@ def _without_islands(
     of the table's masks stays on the top. A part of the object cut off by an occluder is seen as openly as the rest.
     """
     # Pieces: connected components of adjoining points of one instance. density: mean area of a piece's points.
-    n = len(ids)
-    source = np.repeat(np.arange(n), neighborhood.index.shape[1])
-    target = neighborhood.index.ravel()
-    linked = neighborhood.adjoining.ravel() & (ids[source] >= 0) & (ids[source] == ids[target])
-    links = csr_array((np.ones(linked.sum(), bool), (source[linked], target[linked])), shape=(n, n))
-    pieces, piece = connected_components(links, directed=False)
     labelled = np.flatnonzero(ids >= 0)
-    piece_area, points = np.bincount(piece, area, pieces), np.bincount(piece, minlength=pieces)
-    density, majority = piece_area / points, np.bincount(piece, share, pieces) > 0.5 * points
+    own, near = ids[labelled], neighborhood.index[labelled]
+    linked = neighborhood.adjoining[labelled] & (ids[near] == own[:, None])
+    number = np.cumsum(ids >= 0) - 1  # of each labelled point among them
+    target, starts = number[near[linked]], np.append(0, np.cumsum(np.count_nonzero(linked, axis=1)))
+    links = csr_array((np.ones(len(target), bool), target, starts), shape=(len(labelled), len(labelled)))
+    pieces, part = connected_components(links, directed=False)
+    piece_area, points = np.bincount(part, area[labelled], pieces), np.bincount(part, minlength=pieces)
+    density, majority = piece_area / points, np.bincount(part, share[labelled], pieces) > 0.5 * points
     # The main piece of each instance is the one that its masks show most of: it is written last.
-    order = labelled[np.argsort(piece_area[piece[labelled]], kind="stable")]
-    main = np.zeros(int(ids.max(initial=-1)) + 1, np.int64)
-    main[ids[order]] = piece[order]
-    part, main_part = piece[labelled], main[ids[labelled]]
+    order = np.argsort(piece_area[part], kind="stable")
+    main = np.zeros(int(own.max(initial=-1)) + 1, np.int64)
+    main[own[order]] = part[order]
+    main_part = main[own]
     island = (part != main_part) & (~majority[part] | (density[part] < min_share * density[main_part]))
     kept = ids.copy()
     kept[labelled[island]] = UNOBSERVED

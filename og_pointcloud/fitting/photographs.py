@@ -48,7 +48,7 @@ class Photographs:
         return cls(tuple(name for name, _ in number), np.array(of_view, np.int32), of_mask, first)
 
     def joined(self, table: MaskTable) -> MaskTable:
-        """The table of photographs from one of views. It replaces that one, whose entries may be overwritten."""
+        """The table of photographs from one of views."""
         if len(self.names) == len(self.of_view):
             return table
         views = self.of_view, len(self.names)
@@ -72,10 +72,8 @@ def _summed(matrix: csr_array, target: NDArray[np.integer], count: int) -> csr_a
     """(count, n) sparse: the sums of the rows with each target. target: (rows,) the row of the result for each row."""
     parts = np.argsort(target, kind="stable")
     first = np.searchsorted(target[parts], np.arange(count + 1))
-    # In place if rows are taken in order: writing then never overtakes reading.
-    columns, values = matrix.indices, matrix.data
-    if (np.diff(parts) < 0).any():
-        columns, values = scratch_like(columns, np.int32), scratch_like(values, np.float32)
+    # Never in place: another matrix may have the same columns.
+    columns, values = scratch_like(matrix.indices, np.int32), scratch_like(matrix.data, np.float32)
     starts = _add_rows((matrix.indptr, matrix.indices, matrix.data), parts, first, matrix.shape[1], columns, values)
     return csr_array((values[: starts[-1]], columns[: starts[-1]], starts), shape=(count, matrix.shape[1]))
 

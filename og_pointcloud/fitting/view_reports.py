@@ -438,8 +438,9 @@ def _mean_field(
     influence: NDArray[np.float32],
 ) -> LikelyStates:
     """State probabilities from the unary potentials, then MEAN_FIELD_ROUNDS updates by the neighbors."""
-    start, state, probability = candidates.start, candidates.state, np.zeros_like(unary)
-    for _ in range(1 + MEAN_FIELD_ROUNDS):  # in the first, neighbors' probabilities are 0
+    start, state = candidates.start, candidates.state
+    probability = _mean_field_round(start, state, unary, unary, neighbors[:, :0], influence[:, :0])  # without neighbors
+    for _ in range(MEAN_FIELD_ROUNDS):
         probability = _mean_field_round(start, state, unary, probability, neighbors, influence)
     return replace(candidates, probability=probability)
 

@@ -85,10 +85,14 @@ def pixel_widths(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.
         uv, depth = camera.project(xyz)
         shown = camera.shows(uv) & (depth > 0)
         width[shown] = np.linalg.norm(xyz[shown] - camera.center, axis=1) / np.sqrt(camera.fx * camera.fy)
-    seen = np.isfinite(widths).any(axis=0)
-    found = np.full(len(xyz), np.nan)
-    found[seen] = np.nanquantile(widths[:, seen], NEAREST_SHARE, axis=0)
-    return found
+    # The quantile over the views that show a point, between the two ranks beside it. (np.nanquantile takes ten times
+    # as long.)
+    widths.sort(axis=0)  # NaN last
+    last = np.count_nonzero(np.isfinite(widths), axis=0) - 1
+    rank = NEAREST_SHARE * np.maximum(last, 0)
+    low = rank.astype(np.intp)
+    below, above = np.take_along_axis(widths, np.stack([low, np.minimum(low + 1, np.maximum(last, 0))]), axis=0)
+    return below + (rank - low) * (above - below)
 
 
 def _levels(xyz: NDArray[np.float32], views: Sequence[View]) -> tuple[NDArray[np.float64], float]:

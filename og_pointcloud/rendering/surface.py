@@ -64,9 +64,11 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     """Find the points that are needed, their spacing, and the Gaussians that they are drawn as."""
     is_paper = settings.mode == "paper"
     row_of_point = None
-    if not (is_paper and scene.points.are_gaussians):  # overlapping Gaussians look right only together
-        scene, row_of_point = with_distinct_points(scene, journal) if is_paper else with_needed_points(scene, journal)
     with journal.stage("spacing"):
+        if not is_paper:
+            scene, row_of_point = with_needed_points(scene, journal)
+        elif not scene.points.are_gaussians:  # overlapping Gaussians look right only together
+            scene, row_of_point = with_distinct_points(scene, journal)
         scene, row_of_point = _in_morton_order(scene, row_of_point)
         if not is_paper:  # mode paper draws its own views, one per step
             scene = with_needed_views(scene, settings.geometry.enough_views, journal)
