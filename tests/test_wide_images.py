@@ -14,7 +14,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.formats import capture
 from og_pointcloud.formats.capture import read_capture, read_poses
-from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.scene import NOT_SEEN
@@ -71,8 +71,10 @@ def write_panoramas(folder, lens="EQUIRECTANGULAR", size=SIZE, circle=False):
     content = {**keys, "cx": width / 2, "cy": height / 2, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content))
     write_features(folder, {"feature_space": np.array("tiny"), **features})
-    xyz = dict(zip("xyz", balls().reshape(-1, 3).T, strict=True))
-    write_ply(folder / "points.ply", {"vertex": join_columns(xyz)})
+    # In the colors of the images, which are written as blue, green, red.
+    ball = np.repeat(np.arange(1, 7), 400)
+    rgb = np.stack([np.full_like(ball, 90), 255 - ball * 20, ball * 30], axis=1).astype(np.uint8)
+    write_ply(folder / "points.ply", {"vertex": plain_rows(balls().reshape(-1, 3), rgb)})
     return folder
 
 
