@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labelled_clouds import room
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -215,6 +216,26 @@ def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said):
     assert mapper.points == sequence
 
 
+@pytest.mark.parametrize("said", ["has no camera", "its camera is a ndarray", "a frame is a str; expected an og.Frame"])
+def test_a_bad_first_frame_is_refused_in_the_same_words(said):
+    with pytest.raises(SceneError, match=said):
+        og.Mapper().integrate(bad_frames()[said])
+
+
+def test_a_map_takes_over_the_encoder_that_a_frame_names():
+    given = frames(THINGS)[:4]
+    for mapper in (og.Mapper(), og.Mapper(replace(mapped(given)[0].snapshot().cloud, feature_space="unknown"))):
+        mapper.integrate(given[0])
+        mapper.integrate(replace(given[1], feature_space="clip"))
+        mapper.integrate(given[2])  # does not say
+        with pytest.raises(FeatureSpaceError, match=r"'siglip'.*; expected feature space 'clip'"):
+            mapper.integrate(replace(given[3], feature_space="siglip"))
+    empty = og.Mapper()
+    empty.integrate(replace(given[0], feature_space="clip"))
+    empty.integrate(given[1])
+    assert empty.snapshot().cloud.feature_space == "clip"
+
+
 def test_a_pose_that_float32_rounded_is_told():
     frame = frames(THINGS)[0]
     mapped_camera = og.in_world(frame.camera, (431234.567, 5412345.678, 312.345))
@@ -256,6 +277,11 @@ def test_an_outlier_of_a_known_cloud_does_no_harm():
 def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
     with pytest.raises(OgPointcloudError, match="settings is a str; expected an"):
         og.Mapper(settings="grouping")
+    for known in ({"start": room(500)}, {"cloud": np.eye(3)}):
+        with pytest.raises(SceneError, match=r"spacing is 0\.5, but a map or a cloud is given"):
+            og.Mapper(spacing=0.5, **known)
+    with pytest.raises(FeatureSpaceError, match="by feature_space, are in feature space 'another/encoder'; expected"):
+        og.Mapper(room(500), feature_space="another/encoder")
     with pytest.raises(SceneError, match=r"points are a list of <U1 \(1, 3\)"):
         og.Mapper(cloud=[["a", "b", "c"]])
     for spacing in ("1", True):
@@ -379,7 +405,8 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
                 break
     torn = folder / "frames.log"
     torn.write_bytes(torn.read_bytes() + map_journal.MAGIC + b"half a frame")
-    mapper = og.Mapper(feature_space=SPACE, journal=folder)
+    with pytest.warns(UserWarning, match=r"frames\.log ends in the middle of a change"):
+        mapper = og.Mapper(feature_space=SPACE, journal=folder)
     assert mapper.holds(done)
     for frame in given:
         if not mapper.holds(frame.stamp):
@@ -392,6 +419,98 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
     assert torn.stat().st_size < 4_000_000
     with pytest.raises(OgPointcloudError, match="began with"):
         og.Mapper(cloud=np.eye(3), journal=folder)
+
+
+def test_a_journal_goes_on_only_with_what_it_began_with(tmp_path, monkeypatch):
+    from og_pointcloud.mapping import map_journal
+
+    mapper, _ = mapped(frames(THINGS)[:2], spacing=0.1, journal=tmp_path)
+    same = {"feature_space": SPACE, "spacing": 0.1}
+    for others in ({"spacing": None}, {"feature_space": "another/encoder"}, {"settings": og.FitSettings(seed=1)}):
+        with pytest.raises(OgPointcloudError, match=r"has a map that began with 0 points .*, not with 0 points"):
+            og.Mapper(journal=tmp_path, **{**same, **others})
+    with pytest.raises(OgPointcloudError, match=r"began with 0 points .*, not with 3 points"):
+        og.Mapper(cloud=np.eye(3), feature_space=SPACE, journal=tmp_path)
+    # A smaller memory limit, as after a kill for want of memory, is no other map. The log is as it was.
+    again = og.Mapper(settings=og.FitSettings(memory=1 << 30), journal=tmp_path, **same)
+    assert again.points == mapper.points
+    # The log says it again once it starts anew.
+    monkeypatch.setattr(map_journal, "MAX_LOG_BYTES", 1000)
+    again.integrate(frames(THINGS)[2])
+    assert (tmp_path / "frames.log").stat().st_size == 0
+    monkeypatch.undo()
+    again.integrate(frames(THINGS)[3])
+    (tmp_path / "map.state").unlink()
+    with pytest.raises(OgPointcloudError, match="began with 0 points"):
+        og.Mapper(feature_space=SPACE, journal=tmp_path)
+
+
+def test_a_damaged_journal_is_refused_and_only_a_torn_end_is_cut(tmp_path):
+    mapper, _ = mapped(frames(THINGS)[:2], journal=tmp_path)
+    points, log = mapper.points, tmp_path / "frames.log"
+    whole = log.read_bytes()
+    mapper.integrate(frames(THINGS)[2])
+    longer = log.read_bytes()
+    for byte in (len(whole) // 2, len(whole)):  # in the middle of a record, and in the header of the last one
+        damaged = bytearray(longer + b"\0" * 1000)
+        damaged[byte] ^= 1
+        log.write_bytes(damaged)
+        with pytest.raises(OgPointcloudError, match=rf"is damaged at byte \d+ of {len(damaged)}: remove the folder"):
+            og.Mapper(feature_space=SPACE, journal=tmp_path)
+        assert log.read_bytes() == damaged
+    for end in (longer[:-1], longer[: len(whole) + 20], longer[: len(whole) + 5]):
+        log.write_bytes(end)
+        with pytest.warns(UserWarning, match=f"its last {len(end) - len(whole)} bytes were cut off") as said:
+            again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+        assert (said[0].filename, again.points, log.read_bytes()) == (__file__, points, whole)
+
+
+def test_a_frame_after_an_interrupted_one_is_in_the_journal(tmp_path, monkeypatch):
+    """The interrupted one leaves its number to the next."""
+    module, given = sys.modules["og_pointcloud.mapping.mapper"], frames(THINGS)[:3]
+    vote = module.vote
+
+    def interrupted(frame, *rest):
+        if frame.stamp == given[1].stamp:
+            raise KeyboardInterrupt
+        return vote(frame, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "vote", interrupted)
+        mapper, _ = mapped(given[:1], journal=tmp_path)
+        with pytest.raises(KeyboardInterrupt):
+            mapper.integrate(given[1])
+        mapper.integrate(given[2])
+    again = og.Mapper(feature_space=SPACE, journal=tmp_path)
+    assert [again.holds(frame.stamp) for frame in given] == [True] * 3
+
+
+@pytest.mark.slow
+def test_the_point_size_that_a_snapshot_chose_is_in_the_journal(tmp_path):
+    """Frames without depth that come later see the points in this size."""
+    capture, given = scene(THINGS), without_depth(frames(THINGS))
+    mapper, _ = mapped(given[:8], cloud=capture.points, journal=tmp_path)
+    mapper.snapshot()
+    for frame in given[8:]:
+        mapper.integrate(frame)
+    known = mapper._map
+    again = og.Mapper(cloud=capture.points, feature_space=SPACE, journal=tmp_path)._map
+    assert (again.scale, again.drawn) == (known.scale, known.drawn)
+    assert known.scale != og.FitSettings().geometry.middle_scale, "the test would not notice another size"
+    np.testing.assert_array_equal(again.votes.weight, known.votes.weight)
+    for one, other in zip(again.kept.views, known.kept.views, strict=True):
+        np.testing.assert_array_equal(one.openness, other.openness)
+
+
+def test_a_closed_mapper_leaves_its_journal_to_others(tmp_path):
+    first, second = frames(THINGS)[:2]
+    with og.Mapper(feature_space=SPACE, journal=tmp_path) as mapper:
+        mapper.integrate(first)
+    code = f"import og_pointcloud as og; og.Mapper(feature_space={SPACE!r}, journal={str(tmp_path)!r})"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    with pytest.raises(OgPointcloudError, match="was closed, or another mapper now writes to it"):
+        mapper.integrate(second)
+    assert not mapper.holds(second.stamp)
 
 
 def test_a_journal_that_cannot_be_written_is_one_error(tmp_path):
@@ -446,7 +565,7 @@ def test_a_journal_is_one_mappers(tmp_path):
     """Another process is kept out; in one process, as in a notebook, the mapper made last has it."""
     given = frames(THINGS)[:2]
     first, _ = mapped(given[:1], journal=tmp_path)
-    code = f"import og_pointcloud as og; og.Mapper(journal={str(tmp_path)!r})"
+    code = f"import og_pointcloud as og; og.Mapper(feature_space={SPACE!r}, journal={str(tmp_path)!r})"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert f"is in use by process {os.getpid()}" in other.stderr
     second, _ = mapped(given[1:], journal=tmp_path)
@@ -561,6 +680,8 @@ def test_a_queue_never_blocks_and_says_what_it_drops():
     slow.close()
     assert slow.dropped == 1
     assert "1 dropped so far" in said[-1]
+    slow.put(given[0])
+    assert (slow.dropped, "after the queue was closed: 2 dropped so far" in said[-1]) == (2, True)
 
 
 def test_a_driver_may_fill_its_buffers_again_behind_a_queue():
@@ -685,6 +806,18 @@ def test_objects_know_since_when_they_stand_where_they_are():
     cloud, objects = mapper.snapshot().cloud, {entry.id: entry for entry in mapper.objects()}
     assert all(objects[instance_of(cloud, thing)].since < 100 for thing in THINGS)
     assert objects[instance_of(cloud, PARCEL)].since >= 100
+
+
+def test_what_comes_back_to_its_place_has_stood_there_since_then_and_has_not_moved():
+    mapper, _ = mapped(frames(THINGS))
+    crate = instance_of(mapper.snapshot().cloud, CRATE)
+    changes = [mapper.integrate(frame) for frame in frames([CHEST, BIN], seed=1, first=100.0)]
+    assert [k for change in changes for k in change.gone] == [crate]
+    for frame in frames(THINGS, seed=2, first=200.0):
+        mapper.integrate(frame)
+    back = {entry.id: entry for entry in mapper.objects()}[crate]
+    assert back.state == "present"
+    assert back.since >= 200
 
 
 def test_snapshots_draw_points_as_large_as_a_fit_does():

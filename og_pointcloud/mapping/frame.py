@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.hosts import world_points
-from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
 from og_pointcloud.formats.depth import lengths
 from og_pointcloud.formats.poses import in_local_frame
@@ -47,7 +47,8 @@ class Frame:
     cloud: (n, 3) float, world coordinates, or any cloud that `og.segment` takes, measured from this camera's position,
     instead of depth.
     rgb: (H, W, 3) uint8. stamp: seconds, or any count that grows with time; None: one more than the last frame's.
-    feature_space: name of the features' encoder, which must be the map's; None: not stated.
+    feature_space: name of the features' encoder, which must be the map's; a map without one takes it over. None: not
+    stated.
 
     >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
     >>> frame = og.Frame(camera, masks=np.full((48, 64), -1), stamp=12.5)
@@ -66,7 +67,8 @@ class Frame:
 @dataclass(frozen=True)
 class CheckedFrame:
     """A frame that passed all checks. camera: pose from the map's local frame. ids: (H, W) int32 mask image, -1 none.
-    features: (M, D) float32. view: surfaces measured by its depth, None without. rgb: (H, W, 3) uint8 or None."""
+    features: (M, D) float32. view: surfaces measured by its depth, None without. rgb: (H, W, 3) uint8 or None. space:
+    of the map's descriptors once the frame is in it."""
 
     camera: Camera
     ids: NDArray[np.int32]
@@ -74,6 +76,7 @@ class CheckedFrame:
     view: MeasuredView | None
     rgb: NDArray[np.uint8] | None
     stamp: float
+    space: FeatureSpace
 
 
 def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stamp: float) -> CheckedFrame:
@@ -96,13 +99,15 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
         raise SceneError(f"{name} has both depth and a cloud; expected only one: leave out the sparser one")
     ids, features = _masks(frame, camera, name)
     if len(features):
-        encoder = space.name if frame.feature_space is None else frame.feature_space
-        space.require(FeatureSpace(encoder, features.shape[1]), f"mask features of {name}")
+        own = FeatureSpace(UNKNOWN_SPACE if frame.feature_space is None else frame.feature_space, features.shape[1])
+        space.require(own, f"mask features of {name}")
+        space = FeatureSpace(own.name if space.name == UNKNOWN_SPACE else space.name, own.width)
     depth = _depth(frame, origin, camera, name)
     rgb = None if frame.rgb is None else numbers_of(frame.rgb)
     if rgb is not None and (rgb.shape != (camera.height, camera.width, 3) or rgb.dtype != np.uint8):
         raise SceneError(f"{name}: rgb is {rgb.dtype} {rgb.shape}; expected uint8 ({camera.height}, {camera.width}, 3)")
-    return CheckedFrame(camera, ids, features, view_of_depth(depth, camera) if depth.any() else None, rgb, float(stamp))
+    view = view_of_depth(depth, camera) if depth.any() else None
+    return CheckedFrame(camera, ids, features, view, rgb, float(stamp), space)
 
 
 def in_arrays(frame: Frame) -> Frame:

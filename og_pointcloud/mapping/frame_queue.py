@@ -20,8 +20,9 @@ class FrameQueue:
     """Feeds a mapper in its own thread, in order of arrival.
 
     max_age: seconds that a frame may wait. on_change: called in that thread with each frame's change. on_drop: called
-    with a message for each frame that was dropped, because of its age or because it was refused, and if on_change
-    fails; None: a warning. lock: held while a frame is integrated; hold it to use or replace the mapper.
+    with a message for each frame that was dropped, because of its age, because it was refused or came after `close`,
+    and if on_change fails; None: a warning. lock: held while a frame is integrated; hold it to use or replace the
+    mapper.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class FrameQueue:
         self.mapper, self.max_age, self.dropped = mapper, max_age, 0
         self._on_change, self._on_drop = on_change or (lambda change: None), on_drop or warnings.warn
         self._waiting: queue.SimpleQueue[tuple[float, Frame] | None] = queue.SimpleQueue()
-        self.lock = threading.Lock()
+        self.lock, self._gate, self._closed = threading.Lock(), threading.Lock(), False
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -43,11 +44,18 @@ class FrameQueue:
         """Hand a frame over; returns at once. It is copied: a driver may write into its arrays again."""
         with suppress(Exception):  # anything but a frame of arrays is refused, and reported, in its turn
             frame = deepcopy(in_arrays(frame))
-        self._waiting.put((time.monotonic(), frame))
+        with self._gate:  # never held for long
+            if not self._closed:
+                self._waiting.put((time.monotonic(), frame))
+                return
+            self.dropped += 1
+        self._on_drop(f"a frame came after the queue was closed: {self.dropped} dropped so far")
 
     def close(self) -> None:
         """Process the waiting frames that are not too old, and end the thread."""
-        self._waiting.put(None)
+        with self._gate:
+            self._closed = True
+            self._waiting.put(None)
         self._thread.join()
 
     def _work(self) -> None:

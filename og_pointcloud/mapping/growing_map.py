@@ -109,6 +109,7 @@ class GrowingMap:
         points, view, before = self.points, frame.view, self.points.n
         if view is None or not points.grows:
             return np.zeros(0, np.int32)
+        left = np.flatnonzero(~points.alive)
         image, camera = DepthImage(view.depth, view.camera), view.camera
         step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
         chosen = on_surface(image, view.noise, step, slanted=True)
@@ -124,7 +125,8 @@ class GrowingMap:
         added = np.arange(before, points.n, dtype=np.int32)
         self.grow()
         self.presence.balance[added], self.presence.seen_at[added] = 1, frame.stamp
-        self.kept.born[added] = self.sequence
+        # What comes where others had left takes their rows.
+        self.kept.born[added] = self.kept.born[left[points.weight[left] > 0]] = self.sequence
         return added
 
     def owners(self) -> NDArray[np.int32]:
@@ -255,7 +257,7 @@ def vote(frame: CheckedFrame, known: GrowingMap, seen: Seen) -> tuple[list[int],
 
     Returns the tracks that are now objects and need an id, and those with an id that were seen again.
     """
-    known.space = replace(known.space, width=frame.features.shape[1])  # not known before the first mask
+    known.space = frame.space  # its width is not known before the first mask, its name perhaps later
     points, seen_at = seen.points, known.presence.seen_at
     away = np.linalg.norm(known.points.xyz[points] - frame.camera.center, axis=1)
     view = KeptView.of(frame, known.sequence, seen.found, seen.rows)

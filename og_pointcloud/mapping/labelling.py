@@ -17,7 +17,7 @@ from og_pointcloud.mapping.kept_views import KeptView
 from og_pointcloud.rendering.geometry import Neighborhood, drawn_spacing, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, GeometrySettings
 
 
 def labelled(map_: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, settings: FitSettings) -> LabelledCloud:
@@ -62,12 +62,17 @@ def _choose_scale(
     views = [View(f"{k:09d}", kept[k].camera, kept[k].masks, kept[k].features) for k in drawn]
     near = near_plane(points.xyz, (view.camera for view in views))
     scale = choose_scale(points, spacing, thickness, views, near, settings, journal).scale
-    map_.drawn, before, map_.scale = len(drawn), map_.scale or settings.geometry.middle_scale, scale
-    for k in drawn if scale != before else ():
-        view = kept[k]
-        frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp)
-        seen = drawn_points(frame, map_, settings.geometry)
-        kept[k] = KeptView.of(frame, view.sequence, seen.found, seen.rows)
+    draw_again(map_, scale, len(drawn), settings.geometry)
+
+
+def draw_again(map_: GrowingMap, scale: float | None, count: int, geometry: GeometrySettings) -> None:
+    """Draw the map's points at another scale from now on, and for the ``count`` kept views without depth."""
+    map_.drawn, before, map_.scale = count, map_.scale or geometry.middle_scale, scale
+    for k, view in enumerate(map_.kept.views):
+        if scale != before and len(view.packed):
+            frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp, map_.space)
+            seen = drawn_points(frame, map_, geometry)
+            map_.kept.views[k] = KeptView.of(frame, view.sequence, seen.found, seen.rows)
 
 
 def matched_ids(

@@ -1,11 +1,11 @@
 """A map on disk while it grows: a kill -9 at any moment loses at most the frame being integrated.
 
 The folder holds two files of records, each record with its length and checksum. Each change is appended to
-``frames.log`` with its number: a frame, a correction, or the next id after those that a snapshot gave; a torn last one
-is cut off. ``map.state`` is the whole map at some number, replaced atomically; the log then starts empty. A mapper that
-is started with the folder reads the state and replays the log: this restores the map exactly, and the space on disk
-grows with the map, not with time. Nothing is pickled: a record is a tree of plain values and of the dataclasses in
-RECORD_TYPES as JSON, with its arrays as .npy.
+``frames.log`` with its number: a frame, a correction, or what a snapshot chose; a torn last one is cut off.
+``map.state`` is the whole map at some number, replaced atomically; the log then starts empty. Both begin with what the
+map began with. A mapper that is started with the folder reads the state and replays the log: this restores the map
+exactly, and the space on disk grows with the map, not with time. Nothing is pickled: a record is a tree of plain values
+and of the dataclasses in RECORD_TYPES as JSON, with its arrays as .npy.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ RECORD_TYPES = {
 """Dataclasses that a record may hold, by name: nothing else is ever constructed from a file."""
 RECORD_HEADER = struct.Struct("<4sQI")
 """MAGIC, number of bytes that follow, and their CRC-32."""
-MAGIC = b"OGF3"
+MAGIC = b"OGF4"
 LOG, STATE = "frames.log", "map.state"
 MAX_LOG_BYTES = 1 << 27
 """Size of the log above which the whole map is written and the log starts empty."""
@@ -59,6 +59,8 @@ MAX_LOG_BYTES = 1 << 27
 
 Poses = dict[float, NDArray[np.float64]]
 """A correction: stamp -> world_to_camera (4, 4)."""
+Chosen = tuple[int, float | None, int]
+"""By a snapshot: the next id after those that it gave, and `GrowingMap.scale` and ``drawn``."""
 
 
 _OPEN_JOURNALS: WeakValueDictionary[Path, MapJournal] = WeakValueDictionary()
@@ -82,11 +84,19 @@ class MapJournal:
         self.folder = Path(folder)
         self._log, self._state, self._origin = self.folder / LOG, self.folder / STATE, origin
         self._file: io.FileIO | None = None
-        if earlier := _OPEN_JOURNALS.pop(self.folder.resolve(), None):
-            earlier._lock.close()
+        if earlier := _OPEN_JOURNALS.get(self.folder.resolve()):
+            earlier.close()
         self._lock = ExitStack()
         self._lock.enter_context(locked(self.folder))
         _OPEN_JOURNALS[self.folder.resolve()] = self
+
+    def close(self) -> None:
+        """End writing, and let others in."""
+        if _OPEN_JOURNALS.get(self.folder.resolve()) is self:
+            del _OPEN_JOURNALS[self.folder.resolve()]
+        if self._file is not None:
+            self._file.close()
+        self._lock.close()
 
     def state(self) -> GrowingMap | None:
         """The last whole map; None if there is none yet."""
@@ -98,46 +108,68 @@ class MapJournal:
         if not (isinstance(content, tuple) and len(content) == 2 and isinstance(content[1], GrowingMap)):
             raise OgPointcloudError(f"{self._state} is damaged or of another version: remove the folder and map again")
         began_with, map_ = content
-        if began_with != self._origin:
-            raise OgPointcloudError(
-                f"{self.folder} has a map that began with {began_with}, not with {self._origin}: begin with that, or "
-                "give another folder"
-            )
+        self._require_origin(began_with)
         return map_
 
-    def changes(self) -> Iterator[tuple[int, Frame | Poses | int]]:
+    def changes(self) -> Iterator[tuple[int, Frame | Poses | Chosen]]:
         """The changes in the log, in order, with their numbers: those below the map's own are in it already, if it was
-        killed between the two writes. A torn one at the end is cut off, so that new ones follow whole ones."""
+        killed between the two writes. A torn one at the end is cut off with a warning, so that new ones follow whole
+        ones."""
         if not self._log.is_file():
             return
-        intact = 0  # bytes of whole records
+        intact, size = 0, self._log.stat().st_size  # intact: bytes of whole records
         with self._log.open("rb") as file:
             # The file is about to be truncated and written: refuse a link, or a file of something else.
-            if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
+            if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[:size]:
                 raise OgPointcloudError(
                     f"{self._log} was not written by this version and is left as it is: give another folder"
                 )
             while record := _next_record(file):
-                intact = file.tell()
                 entry = unpacked(record, str(self._log))
-                if not (isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], int)):
+                if intact == 0:
+                    self._require_origin(entry)
+                elif isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[0], int):
+                    yield entry
+                else:
                     raise OgPointcloudError(f"{self._log} is damaged: remove the folder and map again")
-                yield entry
-        if intact < self._log.stat().st_size:
-            os.truncate(self._log, intact)
+                intact = file.tell()
+            file.seek(intact)
+            head = file.read(RECORD_HEADER.size)
+        if not head:
+            return
+        # A record that was being written when the process was killed reaches the end of the file; whole ones follow one
+        # that is damaged, and would be lost with it.
+        if len(head) == RECORD_HEADER.size and intact + len(head) + RECORD_HEADER.unpack(head)[1] < size:
+            raise OgPointcloudError(
+                f"{self._log} is damaged at byte {intact} of {size}: remove the folder and map again, or cut the file "
+                "there to lose only the frames from there on"
+            )
+        os.truncate(self._log, intact)
+        what = f"{self._log} ends in the middle of a change: its last {size - intact} bytes were cut off"
+        warnings.warn(what, stacklevel=4)
 
-    def append(self, number: int, change: Frame | Poses | int) -> None:
+    def _require_origin(self, began_with: Any) -> None:
+        if began_with != self._origin:
+            raise OgPointcloudError(
+                f"{self.folder} has a map that began with {began_with!s:.300}, not with {self._origin}: begin with "
+                "that, or give another folder"
+            )
+
+    def append(self, number: int, change: Frame | Poses | Chosen) -> None:
         """Append a change. If that fails, as on a full disk, the log stays as it was."""
         if isinstance(change, Frame):
             change = in_arrays(change)
             if change.masks is not None and change.masks.max(initial=0) < 1 << 15:
                 change = replace(change, masks=change.masks.astype(np.int16))
         if _OPEN_JOURNALS.get(self.folder.resolve()) is not self:
-            raise OgPointcloudError(f"another mapper now writes to '{self.folder}': this one no longer can")
+            raise OgPointcloudError(
+                f"'{self.folder}' was closed, or another mapper now writes to it: this one no longer can"
+            )
         record = _record((number, change))
         with naming(self.folder):
             self._file = self._file or self._log.open("ab", buffering=0)
             intact = self._file.seek(0, os.SEEK_END)  # a failed write has moved the position
+            record = record if intact else _record(self._origin) + record
             try:
                 if self._file.write(record) < len(record):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -44,7 +44,9 @@ def objects_of(map_: GrowingMap) -> list[MapObject]:
         elif len(rows):
             place, bounds = map_.place_of(rows), map_.points.xyz[rows].astype(np.float64) + map_.origin
             looked_at = map_.presence.seen_at[rows].max() > -np.inf
-            state = "moved" if track.moved else "present" if looked_at else "unseen"
+            # Medians are no more certain than the points are dense.
+            moved = track.home is not None and np.linalg.norm(place - track.home) > map_.points.edge
+            state = "moved" if moved else "present" if looked_at else "unseen"
         else:
             continue
         # The median frame that brought its points: half of them were there by then.
@@ -151,5 +153,6 @@ def _reidentified(map_: GrowingMap, k: int, scale: LikenessScale) -> list[Moved]
     assert gone.left is not None
     moved = Moved(best, gone.left.place, map_.place_of(came[best]), best)
     # The id passes to this track; the old one, without points, is dropped at the next pruning.
-    gone.id, gone.left, track.id, track.moved = NO_TRACK, None, best, True
+    track.id, track.home = best, gone.left.place if gone.home is None else gone.home
+    gone.id, gone.left = NO_TRACK, None
     return [moved]

@@ -29,7 +29,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
 from og_pointcloud.mapping.frame import COMPARED_POINTS, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points, measured_points, vote
-from og_pointcloud.mapping.labelling import labelled, matched_ids, with_ids
+from og_pointcloud.mapping.labelling import draw_again, labelled, matched_ids, with_ids
 from og_pointcloud.mapping.map_journal import MapJournal
 from og_pointcloud.mapping.map_objects import MapObject, assign_ids, objects_of, remove_points
 from og_pointcloud.mapping.map_record import MapRecord
@@ -38,7 +38,7 @@ from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
-from og_pointcloud.scene import Points, require_finite, rounded_pose
+from og_pointcloud.scene import Camera, Points, require_finite, rounded_pose
 from og_pointcloud.settings import FitSettings, fit_settings
 
 PIXELS_PER_SPACING = 4.0
@@ -71,8 +71,8 @@ class Mapper:
     so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes; rows with
     NaN or infinity are left out with a warning.
     spacing: of a map that starts empty, in world units; None: from the first depth image. feature_space: name of the
-    masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); a map that it holds already is
-    continued.
+    masks' encoder; by default the map's, or the first that a frame names. journal: a folder that holds the map while it
+    grows (`map_journal`), until `close` or the end of a with block; a map that it holds already is continued.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
@@ -100,6 +100,8 @@ class Mapper:
             raise SceneError("both a map and a cloud are given; expected only one: the map has its own points")
         if spacing is not None and not (isinstance(spacing, Real) and spacing is not True and 0 < spacing < np.inf):
             raise SceneError(f"spacing is {spacing!r}; expected a positive length, or None")
+        if spacing is not None and not (start is None and cloud is None):
+            raise SceneError(f"spacing is {spacing:g}, but a map or a cloud is given, which has its own: leave it out")
         self.settings = fit_settings(settings)
         self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
         self._base = None if start is None else as_scene(start).cloud
@@ -109,6 +111,9 @@ class Mapper:
         self._labelled: tuple[int, LabelledScene] | None = None
         self._changes: Changes | None = None
         if self._base is not None:
+            self._base.space.require(self._space, "features of the frames, by feature_space,")
+            named = self._base.space.name if feature_space == UNKNOWN_SPACE else feature_space
+            self._space = replace(self._base.space, name=named)
             self._continue(self._base)
         elif cloud is not None:
             points = cloud if isinstance(cloud, Points) else Points.from_world(_placed(world_points(cloud)))
@@ -131,7 +136,7 @@ class Mapper:
 
     def _continue(self, base: LabelledCloud) -> None:
         """Adopt a map's points and instances as they are."""
-        map_ = self._start_from(Points(base.xyz, base.origin, base.rgb), base.space, base.spacing, grows=True)
+        map_ = self._start_from(Points(base.xyz, base.origin, base.rgb), self._space, base.spacing, grows=True)
         record, table = MapRecord.of(base), base.instances
         map_.stamp = record.visits[-1].stamp
         for k in range(len(table)):
@@ -154,22 +159,31 @@ class Mapper:
 
     @property
     def _began_with(self) -> str:
-        if self._map is None:
-            return "no point"
-        xyz = self._map.points.xyz
-        return f"{len(xyz)} points (checksum {zlib.crc32(np.ascontiguousarray(xyz).tobytes())})"
+        """What decides how changes are replayed, in words."""
+        xyz = np.zeros((0, 3), np.float32) if self._map is None else self._map.points.xyz
+        checksums = (
+            zlib.crc32(np.ascontiguousarray(xyz).tobytes()),
+            zlib.crc32(repr(replace(self.settings, memory=None)).encode()),
+        )
+        return (
+            f"{len(xyz)} points (checksum {checksums[0]}), spacing {self._spacing}, {self._space}, and settings of "
+            f"checksum {checksums[1]}"
+        )
 
     def _resumed(self, journal: MapJournal) -> MapJournal:
         """Restore and continue what a journal holds."""
         self._map = journal.state() or self._map
         self._journal = None  # changes of the journal are not written to it again
+        # Not those below the growing map's number: an interrupted frame leaves its number to the next one.
+        first = 0 if self._map is None else self._map.sequence
         for number, change in journal.changes():
-            if self._map is not None and number < self._map.sequence:
+            if number < first:
                 continue
             try:
-                if isinstance(change, int):
+                if isinstance(change, tuple):
                     assert self._map is not None
-                    self._map.tracks.next_id = max(self._map.tracks.next_id, change)
+                    self._map.tracks.next_id, scale, drawn = change
+                    draw_again(self._map, scale, drawn, self.settings.geometry)
                 else:
                     self.correct(change) if isinstance(change, dict) else self.integrate(change)
             except OgPointcloudError:
@@ -223,6 +237,17 @@ class Mapper:
         if self._journal is not None:
             self._journal.compact(map_)
         return FrameChange(new_ids, updated, tuple(gone), moved, time.perf_counter() - start)
+
+    def close(self) -> None:
+        """Leave the journal to another mapper or process; this one takes no more frames then."""
+        if self._journal is not None:
+            self._journal.close()
+
+    def __enter__(self) -> Mapper:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def objects(self) -> list[MapObject]:
         """All objects, by id: those that at least two frames have shown, and those that left."""
@@ -279,7 +304,8 @@ class Mapper:
         if map_ is not None:
             valid = checked(frame, map_.origin, map_.space, map_.stamp + 1)
         else:
-            origin = np.zeros(3) if frame.camera is None else frame.camera.center
+            camera = getattr(frame, "camera", None)
+            origin = camera.center if isinstance(camera, Camera) else np.zeros(3)  # others are refused
             valid = checked(frame, origin, self._space, 0.0)
             if valid.view is None:
                 raise SceneError(
@@ -304,17 +330,18 @@ class Mapper:
         rows = rows[chosen[rows]]
         if around is None or not np.array_equal(rows, self._rows):  # the same number may be other points
             around = neighborhood(map_.points.xyz[rows], self.settings.geometry)
+        count, wanted = map_.tracks.next_id, np.zeros(0, np.int64)
+        before = count, map_.scale, map_.drawn
         visit = labelled(map_, rows, around, self.settings)
-        if self._base is not None:
-            return self._folded(self._base, visit, map_)
-        id_of_track = np.array([*(track.id for track in map_.tracks.tracks), -1], np.int32)
-        wanted, count = matched_ids(
-            visit.instance_ids, len(visit.instances), id_of_track[map_.owners()[rows]], map_.tracks.next_id
-        )
-        if self._journal is not None and count > map_.tracks.next_id:
-            self._journal.append(map_.sequence, count)
+        if self._base is None:
+            id_of_track = np.array([*(track.id for track in map_.tracks.tracks), -1], np.int32)
+            known = id_of_track[map_.owners()[rows]]
+            wanted, count = matched_ids(visit.instance_ids, len(visit.instances), known, count)
+        chosen = count, map_.scale, map_.drawn
+        if self._journal is not None and chosen != before:
+            self._journal.append(map_.sequence, chosen)
         map_.tracks.next_id = count
-        return with_ids(visit, wanted, count)
+        return with_ids(visit, wanted, count) if self._base is None else self._folded(self._base, visit, map_)
 
     def _folded(self, base: LabelledCloud, visit: LabelledCloud, map_: GrowingMap) -> LabelledCloud:
         """The map that the mapper continues, with this visit merged in."""

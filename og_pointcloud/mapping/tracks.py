@@ -68,10 +68,11 @@ class PointVotes(Columns):
 class Track:
     """total: (D,) sum of its masks' unit features, weighted by the points that each mask shows; pixels: sum of these
     weights. views, masks: number that showed it. first, sequence: numbers of the first and last frame that did, 0 for
-    an earlier map; last_seen: stamp of the last. id: of the object, NO_TRACK while provisional. moved: it has been
-    elsewhere. box: (2, 3) lowest and highest coordinates of points that voted for it. lost: rows of its points removed
-    as seen through; losing_since: stamp of the first of these. left: its look, once most were removed; left_at: the
-    frame that last showed it: whatever was elsewhere by then is something else."""
+    an earlier map; last_seen: stamp of the last. id: of the object, NO_TRACK while provisional. home: (3,)
+    where it stood before it first left, world coordinates, None for what never came back. box: (2, 3) lowest and
+    highest coordinates of points that voted for it. lost: rows of its points removed as seen through; losing_since:
+    stamp of the first of these. left: its look, once most were removed; left_at: the frame that last showed it:
+    whatever was elsewhere by then is something else."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -81,7 +82,7 @@ class Track:
     sequence: int = 0
     first: int = 0
     id: int = NO_TRACK
-    moved: bool = False
+    home: NDArray[np.float64] | None = None
     box: NDArray[np.float64] = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
     lost: list[int] = field(default_factory=list)
     losing_since: float = -np.inf
@@ -99,7 +100,7 @@ class Track:
             self.total = other.total if self.total is None else self.total + other.total
         for name in ("pixels", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.moved, self.first = self.moved or other.moved, min(self.first, other.first)
+        self.home, self.first = other.home if self.home is None else self.home, min(self.first, other.first)
         self.extend_box(other.box)
         for name in ("views", "last_seen", "sequence"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
