@@ -28,6 +28,8 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import build_parser, common, main
 from og_pointcloud.cli import segment as cli_segment
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.formats.spz import write_spz
+from og_pointcloud.scene import Points
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,31 @@ def test_points_in_a_frame_of_their_own_are_placed_by_a_pose(fitted, tmp_path, c
     np.savetxt(tmp_path / "pose.txt", pose[:3])
     assert "expected a finite 4x4 matrix" in error_of(capsys, *asked)
     assert "expected the cloud that it places" in error_of(capsys, "segment", bundle, *asked[4:])
+
+
+def test_what_a_pose_moves_leaves_its_attributes_behind(fitted, tmp_path, capsys):
+    xyz, object_ids = sample_surfaces()
+    og.segment(xyz, NAMES[:1], fitted[1]).save(tmp_path / "survey.las")
+    ones = np.ones((len(xyz), 4), np.float32)
+    shape = {"scale": 0.01 * ones[:, :3], "rotation": ones / 2, "opacity": ones[:, 0]}
+    write_spz(tmp_path / "splats.spz", Points.from_world(xyz, rgb=COLORS[object_ids], **shape))
+    np.savetxt(tmp_path / "pose.txt", np.eye(4))
+    for cloud, output, lost in (
+        ("survey.las", "o.laz", f"attributes and coordinate system of {tmp_path / 'survey.las'}"),
+        ("survey.las", "o.glb", None),
+        ("splats.spz", "o.glb", "splats"),
+        ("splats.spz", "o.las", None),
+    ):
+        asked = "segment", fitted[1], "--points", tmp_path / cloud, "-o", tmp_path / output
+        said = [line for line in output_of(capsys, *asked).splitlines() if line.startswith("left out")]
+        assert not said, "without a pose nothing is"
+        stdout = output_of(capsys, *asked, "--pose", tmp_path / "pose.txt")
+        (line,) = [line for line in stdout.splitlines() if line.startswith("left out")] or [None]
+        assert (line is None) if lost is None else line.startswith(f"left out: {lost}, ")
+        report = json.loads(output_of(capsys, *asked, "--pose", tmp_path / "pose.txt", "--json"))
+        assert report["left_out"] == (line and line.removeprefix("left out: "))
+    asked = "segment", fitted[1], "--points", tmp_path / "splats.spz", "--pose", tmp_path / "pose.txt"
+    assert "but --pose moves no splats; expected a .ply" in error_of(capsys, *asked, "-o", tmp_path / "o.spz")
 
 
 def test_segment_json_counts_every_point(fitted, capsys):

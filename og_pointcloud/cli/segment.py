@@ -24,7 +24,8 @@ def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     common.add_option(parser, "--points", "CLOUD", "points to label (default: the fitted ones)", type=Path)
     pose = "pose of CLOUD in the scene: a text file of 4 x 4 numbers, from its coordinates to the scene's"
-    common.add_option(parser, "--pose", "POSE.txt", pose, type=Path)
+    kept = "; moved points keep neither splats nor the attributes of .las and .laz"
+    common.add_option(parser, "--pose", "POSE.txt", pose + kept, type=Path)
     files = "labels as .npz, or a colored .ply, .las, .laz or .glb; for splats .glb or .spz"
     common.add_output(parser, "-o", "--output", endings=SAVED_AS, metavar="OUT", help=files)
 
@@ -34,6 +35,8 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.pose and not arguments.points:
         raise OgPointcloudError(f"--pose is '{arguments.pose}' without --points; expected the cloud that it places")
+    if arguments.pose and arguments.output and arguments.output.suffix == ".spz":
+        raise OgPointcloudError(f"-o is '{arguments.output}', but --pose moves no splats; expected a .ply of points")
     journal = Journal(progress=False)
     with journal.stage("load"):
         scene = og.load(arguments.bundle)
@@ -43,14 +46,19 @@ def run(arguments: argparse.Namespace) -> None:
         features = arguments.text_features
         result = og.segment(arguments.points or scene, labels, scene, pose=pose, text_features=features)
     # Splats and the attributes of LAS points are kept as in the file, unless a pose moves them.
-    unmoved = None if arguments.pose else arguments.points
+    unmoved, left_out = None if arguments.pose else arguments.points, None
     if arguments.output:
         with journal.stage("save"):
             # Splat formats are written as splats if the labelled points are splats.
-            points = og.read_points(unmoved) if unmoved and arguments.output.suffix in (".glb", ".spz") else None
+            takes_splats = arguments.points and arguments.output.suffix in (".glb", ".spz")
+            points = og.read_points(arguments.points) if takes_splats else None
             splats = points if points is not None and points.are_gaussians else None
-            result.save(arguments.output, splats, unmoved)
-    report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
+            result.save(arguments.output, splats if unmoved else None, unmoved)
+        if arguments.pose and splats:
+            left_out = "splats, which --pose moves: points are written"
+        elif arguments.pose and {arguments.points.suffix.lower(), arguments.output.suffix} <= {".las", ".laz"}:
+            left_out = f"attributes and coordinate system of {arguments.points}, whose points --pose moves"
+    report = describe_segmentation(result, journal, arguments.bundle, arguments.output, left_out)
     common.print_result(arguments, report, print_segmentation)
     if arguments.json:
         return
@@ -66,12 +74,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def describe_segmentation(
-    result: og.Segmentation, journal: Journal, bundle: Path, output: Path | None
+    result: og.Segmentation, journal: Journal, bundle: Path, output: Path | None, left_out: str | None = None
 ) -> dict[str, Any]:
-    """The output of ``segment --json``: points of each name, and why the others are unknown."""
+    """The output of ``segment --json``: points of each name, why the others are unknown, what the file lacks."""
     return {
         "bundle": str(bundle),
         "output": str(output) if output else None,
+        "left_out": left_out,
         "points": len(result),
         "counts": result.counts(),
         "unknown": int((result.labels < 0).sum()),
@@ -93,5 +102,7 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
             f"{common.calibration_hint(report['bundle'])}"
         )
     print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
+    if report["left_out"]:
+        print(f"left out: {report['left_out']}")
     if report["output"]:
         print(f"wrote {report['output']}")
