@@ -47,12 +47,12 @@ for frame in drive:
 print(log.summary())
 print(f"wrote {draw_drive(out / '07_robot.png', log, instances)}")
 
-for name in ("drive", "drive_labelled"):
+for name in ("07_robot_drive", "07_robot_labelled"):
     shutil.rmtree(out / name, ignore_errors=True)
-report = label_bag(write_drive(out / "drive", drive), out / "drive_labelled", segmenter)
+report = label_bag(write_drive(out / "07_robot_drive", drive), out / "07_robot_labelled", segmenter)
 print(f"bag: {report.clouds} clouds, {report.points / report.seconds:,.0f} points a second")
 store, same = ros2_types(), []
-with open_bag(out / "drive_labelled") as bag:
+with open_bag(out / "07_robot_labelled") as bag:
     topic = [connection for connection in bag.connections if connection.topic == "/points/labelled"]
     for labels, (connection, _, data) in zip(streamed, bag.messages(topic), strict=True):
         rows = read_fields(store.deserialize_cdr(data, connection.msgtype))

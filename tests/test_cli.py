@@ -301,6 +301,17 @@ def test_a_demo_below_a_file_is_refused_before_its_room_is_made(tmp_path, monkey
     assert "is not a folder that can be written to" in error_of(capsys, "demo", "-o", tmp_path / "file" / "demo")
 
 
+def test_a_demo_leaves_the_captures_of_others(tmp_path, monkeypatch, capsys):
+    demo, made = pytest.importorskip("og_pointcloud_room.demo"), []
+    monkeypatch.setattr(demo, "run_demo", lambda *given, **options: made.append(given))
+    (tmp_path / "capture").mkdir()
+    assert "/capture exists, but no demo ended there" in error_of(capsys, "demo", "-o", tmp_path)
+    assert not made
+    (tmp_path / "room.ogpc").touch()
+    output_of(capsys, "demo", "-o", tmp_path)
+    assert made == [(tmp_path,)], "an earlier demo is made again"
+
+
 def rewrite_npz(path, **changes):
     """The same .npz with some entries replaced."""
     with np.load(path) as archive:

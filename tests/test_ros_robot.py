@@ -107,6 +107,8 @@ def true_scene(tmp_path_factory):
 @pytest.mark.slow
 def test_the_example_leaves_a_picture_and_two_bags(true_scene, tmp_path):
     assert len(EXAMPLE.read_text().splitlines()) <= 60
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "mine.txt").write_text("kept")
     command = [sys.executable, str(EXAMPLE), "-o", str(tmp_path), "--scene", str(true_scene), "--frames", "8"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
@@ -118,4 +120,10 @@ def test_the_example_leaves_a_picture_and_two_bags(true_scene, tmp_path):
     assert unknown > 95
     assert same > 99.9
     assert (tmp_path / "07_robot.png").read_bytes().startswith(b"\x89PNG")
-    assert {path.name for path in tmp_path.iterdir()} == {"07_robot.png", "drive", "drive_labelled"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "07_robot.png",
+        "07_robot_drive",
+        "07_robot_labelled",
+        "drive",
+    }
+    assert (tmp_path / "drive" / "mine.txt").read_text() == "kept"

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, check_output, require_room
+from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
@@ -22,7 +23,14 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     require_room()
-    check_output("-o", arguments.output / "room.ogpc", [])
+    room = arguments.output / "room.ogpc"
+    check_output("-o", room, [])
+    for folder in (arguments.output / "capture", arguments.output / "photographs"):
+        if folder.exists() and not room.exists():
+            raise OgPointcloudError(
+                f"{folder} exists, but no demo ended there; expected a new folder: name another (-o), or remove what "
+                "an interrupted demo left"
+            )
     from og_pointcloud_room.demo import run_demo
 
     run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise, photographs=arguments.photographs)
