@@ -21,7 +21,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.collection.index import index
 from og_pointcloud.collection.lance import write_lance
-from og_pointcloud.collection.store import Atlas
+from og_pointcloud.collection.store import SUPER_JOURNAL_MARK, Atlas
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.show.findings_page import picture, png_bytes
 
@@ -363,6 +363,51 @@ def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
     assert og.Collection(folder.parent / "atlas").scenes == collection.scenes[1:]
 
 
+def killed_in_a_change(folder: Path, target: Path) -> str:
+    """Copy an atlas and its journal as a kill in the middle of a change leaves them; returns an answer from before."""
+    collection = indexed(folder, many(3))
+    before, content = collection.find("chair", top=100).to_json(), collection.path.read_bytes()
+    with Atlas.writing(collection.path) as atlas:
+        atlas._run("PRAGMA cache_size = 2")  # so that SQLite writes to the file before the change ends
+        atlas.remove(collection.scenes[0])
+        atlas.add_words(("",) * 2000, np.ones((2000, 16), np.float32))
+        target.mkdir()
+        for name in ("atlas", "atlas-journal"):
+            shutil.copy(folder.parent / name, target / name)
+    assert (target / "atlas").read_bytes() != content
+    return before
+
+
+def test_readers_see_the_atlas_before_a_change_that_was_killed(folder, tmp_path):
+    before, killed = killed_in_a_change(folder, tmp_path / "killed"), tmp_path / "killed"
+    assert og.Collection(killed / "atlas").find("chair", top=100).to_json() == before
+    assert [file.name for file in killed.iterdir()] == ["atlas"]
+
+
+def test_a_killed_change_that_cannot_be_undone_is_told(folder, tmp_path, monkeypatch):
+    killed_in_a_change(folder, tmp_path / "killed")
+    connect = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", lambda path, **options: connect(path.replace("=rw", "=ro"), **options))
+    with pytest.raises(OgPointcloudError, match="a killed index run may have to be undone: run og-pointcloud index"):
+        og.Collection(tmp_path / "killed" / "atlas")
+
+
+def test_a_journal_deletes_no_other_file(folder, tmp_path):
+    """SQLite removes the "super-journal" that a journal names at its end, once the change is undone."""
+    killed_in_a_change(folder, tmp_path / "killed")
+    precious, journal = tmp_path / "precious", tmp_path / "killed" / "atlas-journal"
+    precious.write_text("mine")
+    name = os.fsencode(precious)
+    page = (1 << 30) // int.from_bytes(journal.read_bytes()[24:28], "big") + 1
+    numbers = [number.to_bytes(4, "big") for number in (page, len(name), sum(name))]
+    with journal.open("ab") as file:
+        file.write(numbers[0] + name + b"".join(numbers[1:]) + SUPER_JOURNAL_MARK)
+    for use in (og.Collection, lambda path: index(folder, path, progress=False)):
+        with pytest.raises(OgPointcloudError, match="atlas-journal names another file, which would be deleted"):
+            use(tmp_path / "killed" / "atlas")
+    assert precious.read_text() == "mine"
+
+
 def test_a_full_disk_leaves_nothing_of_a_new_atlas(tmp_path):
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -402,6 +447,22 @@ def test_an_open_collection_notices_a_changed_atlas(folder):
     assert collection.scenes == ("a", "c")
     collection.path.unlink()
     with pytest.raises(OgPointcloudError, match="is not a file; expected an atlas"):
+        collection.find("chair")
+
+
+def test_an_atlas_that_changes_while_it_is_asked_is_asked_again(folder, monkeypatch):
+    collection = indexed(folder, {"a": scene(["desk"]), "b": scene(["chair"], 1)})
+    vectors = og.Collection._vectors
+
+    def slow(*arguments):
+        monkeypatch.undo()
+        indexed(folder, {"b": scene(["lamp"], 3), "c": scene(["lamp", "chair"], 2)})
+        return vectors(*arguments)
+
+    monkeypatch.setattr(og.Collection, "_vectors", slow)
+    assert collection.find("chair", scenes=iter(["?"]))[0].scene == "c"
+    monkeypatch.setattr(og.Collection, "_vectors", lambda *_: og.Collection(folder))  # an error of its own
+    with pytest.raises(OgPointcloudError, match="is not a file"):
         collection.find("chair")
 
 

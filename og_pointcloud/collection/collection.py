@@ -175,8 +175,26 @@ class Collection:
             arrays = {name: numbers_of(vector) for name, vector in words.items()}
             given = resolve_labels(arrays, None, None, UNKNOWN_SPACE)
         box = None if within is None else _corners(within)
+        scenes = scenes if scenes is None or isinstance(scenes, str) else tuple(scenes)
         self._open()
-        query = _Query(self._ids(scenes), box, top)
+        try:
+            return self._found(names, features, given, _Query(self._ids(scenes), box, top))
+        except OgPointcloudError:
+            before = self._stamp
+            self._open()
+            if self._stamp == before:
+                raise
+            # Another process changed the atlas meanwhile: what was read of it belongs to what it was.
+            return self._found(names, features, given, _Query(self._ids(scenes), box, top))
+
+    def _found(
+        self,
+        names: tuple[str, ...],
+        features: tuple[Vocabulary, str] | None,
+        given: Vocabulary | None,
+        query: _Query,
+    ) -> Findings:
+        """Arguments as in `_vectors`."""
         asked = [group for group in self._groups if query.scenes_of(group)]
         vectors = [self._vectors(group.family, names, features, given) for group in asked]
         if not any(vectors):
@@ -202,7 +220,7 @@ class Collection:
             "there is unknown"
             for (word, space), count in sorted(counts.items())
         )
-        return Findings((finding for _, finding in ranked[:top]), not_asked)
+        return Findings((finding for _, finding in ranked[: query.top]), not_asked)
 
     def _ids(self, scenes: str | Iterable[str] | None) -> set[int] | None:
         """Ids of the scenes that names or patterns match; None, meaning all, stays None."""

@@ -51,6 +51,8 @@ INSTANCE_RECORD = np.dtype([
 ])  # fmt: skip
 """Record of an instance: columns of its `InstanceTable`, and the low and high corner of the axis-aligned box of its
 main part, in the scene's unit, 0 where it has no points."""
+SUPER_JOURNAL_MARK = bytes.fromhex("d9d505f920a163d7")
+"""The last bytes of a journal that names another file, which SQLite would delete (readSuperJournal in its pager.c)."""
 LOCK_TIMEOUT_S = 30.0
 """Seconds that a change waits for another one to finish."""
 
@@ -96,7 +98,15 @@ class Atlas:
         if not path.is_file():
             raise OgPointcloudError(f"{path} is not a file; expected an atlas: make it with og-pointcloud index")
         with cls._connected(path, "ro") as atlas:
-            atlas._check()
+            try:
+                atlas._check()
+            except sqlite3.OperationalError as error:
+                if "readonly" not in str(error):
+                    raise
+                # The journal of a killed change, which SQLite undoes only for those who may write.
+                with cls._connected(path, "rw") as writable:
+                    writable._check()
+                atlas._check()
             yield atlas
 
     @classmethod
@@ -126,7 +136,12 @@ class Atlas:
     @contextmanager
     def _connected(cls, path: Path, mode: str, file: Path | None = None) -> Iterator[Atlas]:
         """file: its path until it is moved to ``path``."""
-        uri = f"{(file or path).resolve().as_uri()}?mode={mode}"
+        uri, journal = f"{(file or path).resolve().as_uri()}?mode={mode}", path.with_name(f"{path.name}-journal")
+        if mode == "rw" and file is None and journal.is_file():
+            with journal.open("rb") as stream:
+                stream.seek(max(0, journal.stat().st_size - len(SUPER_JOURNAL_MARK)))
+                if stream.read() == SUPER_JOURNAL_MARK:
+                    raise _refused(path, f"{journal.name} names another file, which would be deleted")
         try:
             with closing(sqlite3.connect(uri, uri=True, timeout=LOCK_TIMEOUT_S, isolation_level=None)) as connection:
                 # Recommended by SQLite for untrusted files (sqlite.org/security.html).
@@ -297,7 +312,10 @@ def _explained(path: Path, reason: str) -> OgPointcloudError:
         return OgPointcloudError(f"{path} is being changed by another process; wait for it, then try again")
     if "unable to open" in reason:
         return OgPointcloudError(f"{path} cannot be opened ({reason}); expected a file in a folder that you may use")
-    if "full" in reason or "readonly" in reason or "I/O" in reason:
+    if "readonly" in reason:
+        what = f"{path} cannot be written ({reason}), and a killed index run may have to be undone"
+        return OgPointcloudError(f"{what}: run og-pointcloud index again where you may write")
+    if "full" in reason or "I/O" in reason:
         return OgPointcloudError(f"{path} cannot be written ({reason}): it is unchanged; free some space")
     return _refused(path, reason)
 
