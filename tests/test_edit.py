@@ -480,6 +480,11 @@ def test_commands(scene, splats, tmp_path, capsys):
     recolored = og.read_points(tmp_path / "c.ply").rgb[
         np.isin(scene.instance_ids, og.select(scene, WORDS[1]).instances)
     ]
+    for color in ("1,1,1", "0,0,1.0"):
+        assert edit("recolor", bundle, "--word", WORDS[1], "--color", color, "-o", tmp_path / "dark.ply") == 0
+    capsys.readouterr()
+    assert edit("recolor", bundle, "--word", WORDS[1], "--color", "0.5,1,0", "-o", tmp_path / "dark.ply") == 2
+    assert "expected whole numbers: scale to 0..255" in capsys.readouterr().err
     brightness = recolored.mean(axis=0) / [90, 80, 70]  # of a nearly black object: the hue is the new one, in the dark
     np.testing.assert_allclose(brightness, brightness.mean(), rtol=0.03)
 

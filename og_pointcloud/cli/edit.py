@@ -47,7 +47,9 @@ def run(arguments: argparse.Namespace) -> None:
     scene = og.load(arguments.bundle)
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
     if arguments.operation == "recolor":
-        options["color"] = common.numbers(arguments.color, "--color", 3)
+        color = common.numbers(arguments.color, "--color", 3)
+        # Typed as 1 or 1.0, it is of 255: only in Python may a float of 1 mean full.
+        options["color"] = [int(value) if value.is_integer() else value for value in color]
     done = getattr(og.edit, arguments.operation)(scene, what_to_edit(arguments), arguments.output, **options)
     record: dict[str, Any] = {"output": str(done.path), "operation": arguments.operation, "points": done.points}
     record |= {"changed": done.changed, "instances": list(done.instances), "notes": list(done.notes)}
