@@ -65,6 +65,15 @@ def ids_of(folder: Path, name: str):
     return cv2.imread(str(folder / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
 
 
+def test_words_are_a_list_like_any_other(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("og_pointcloud.masking.make_masks.make_masks", lambda *given, **_: asked.append(given) or 1 / 0)
+    for line in (["--words", "red chair,lamp", str(tmp_path)], [str(tmp_path), "--encoder", "none"]):
+        assert main(["masks", *line]) == 2, "it ends where masks are made"
+    assert [folder for folder, *_ in asked] == [tmp_path, tmp_path]
+    assert [settings.words for _, settings, _ in asked] == [("red chair", "lamp"), ()]
+
+
 def test_a_capture_gets_masks_that_can_be_read(tmp_path):
     world = make_capture(tmp_path / "c")
     made = make_masks(tmp_path / "c", ALONE, progress=False)
@@ -163,6 +172,62 @@ def test_killed_in_the_middle_nothing_is_lost_and_nothing_done_twice(tmp_path):
     assert len((tmp_path / "log2").read_text()) == 5 - len(kept)
     for name in world.names:
         assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
+
+
+def test_masks_that_are_half_replaced_are_without_features(tmp_path, monkeypatch):
+    """The old rows would be read with the new masks."""
+    world = make_capture(tmp_path / "c", 2)
+    make_masks(tmp_path / "c", QUICK, progress=False)
+    with monkeypatch.context() as patch:
+        patch.setattr("og_pointcloud.masking.make_masks.write_png", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_masks(tmp_path / "c", replace(QUICK, level="small"), progress=False)
+    with pytest.raises(SceneError, match=r"has masks/ but no mask_features\.npz"):
+        read_capture(tmp_path / "c")
+    made = make_masks(tmp_path / "c", replace(QUICK, level="small"), progress=False)
+    assert (made.done_before, len(read_capture(tmp_path / "c").views)) == (2, len(world.names))
+
+
+def test_masks_of_faces_are_made_again_for_another_lens(tmp_path):
+    capture, sides = tmp_path / "c", {"fl_x": 20.0, "fl_y": 20.0, "w": WIDTH, "h": HEIGHT, "k1": 0.0}
+    make_capture(capture, 1)
+    poses = json.loads((capture / "transforms.json").read_text())
+    for lens, done_before in ((sides, 0), (sides, None), ({**sides, "k1": 0.05}, 0), ({**sides, "fl_x": 22.0}, 0)):
+        content = {**poses, **lens, "camera_model": "OPENCV_FISHEYE"}
+        (capture / "transforms.json").write_text(json.dumps(content))
+        made = make_masks(capture, QUICK, progress=False)
+        assert made.images > 1
+        assert made.done_before == (made.images if done_before is None else done_before)
+
+
+@pytest.mark.parametrize("name", ["file", "allow_pickle", "args", "kwds"])
+def test_images_may_have_any_name(tmp_path, name):
+    world = make_capture(tmp_path / "c", 2)
+    rename_image(tmp_path / "c", world.names[1], name)
+    make_masks(tmp_path / "c", QUICK, progress=False)
+    assert [view.name for view in read_capture(tmp_path / "c").views] == [world.names[0], name]
+
+
+def test_an_image_called_as_the_encoders_name_is_refused(tmp_path):
+    world = make_capture(tmp_path / "c", 2)
+    rename_image(tmp_path / "c", world.names[1], "feature_space")
+    with pytest.raises(OgPointcloudError, match=r"feature_space\.png has the name by which mask_features\.npz"):
+        make_masks(tmp_path / "c", QUICK, progress=False)
+    assert not (tmp_path / "c" / WORK_FOLDER).exists()
+
+
+def rename_image(capture: Path, old: str, new: str):
+    (capture / "images" / f"{old}.png").rename(capture / "images" / f"{new}.png")
+    poses = capture / "transforms.json"
+    poses.write_text(poses.read_text().replace(f"images/{old}.png", f"images/{new}.png"))
+
+
+def test_links_to_a_capture_that_was_moved_are_made_again(tmp_path):
+    make_capture(tmp_path / "before", 2)
+    make_masks(tmp_path / "before", replace(QUICK, every=2), tmp_path / "half", progress=False)
+    (tmp_path / "before").rename(tmp_path / "after")
+    make_masks(tmp_path / "after", replace(QUICK, every=2), tmp_path / "half", progress=False)
+    assert len(read_capture(tmp_path / "half").points) == 50
 
 
 def test_other_settings_and_other_images_are_done_anew(tmp_path):

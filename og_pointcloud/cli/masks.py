@@ -10,7 +10,7 @@ import warnings
 from functools import partial
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next, some_of, warn_of_poses
+from og_pointcloud.cli.common import Parser, add_option, add_shared, names_in, print_next, some_of, warn_of_poses
 from og_pointcloud.errors import counted
 
 
@@ -23,7 +23,7 @@ def add(parser: Parser) -> None:
     option("--encoder", "E", encoders, default="demo")
     ways = "crops: several encoder runs per mask (default); dense: one run per image, faster and coarser"
     option("--features", None, ways, default="crops", choices=("crops", "dense"))
-    option("--words", "WORD", "mask only these; needs SAM 3", nargs="+", default=())
+    option("--words", "A,B,C", "mask only these; needs SAM 3")
     follow = "follow objects from image to image: by SAM 3's words, or by ids that are the same in all PNGs of a folder"
     parser.add_argument("--tracks", action="store_true", help=follow)
     level = "how much one mask covers (default: %(default)s)"
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
         features=arguments.features,
         longest_side=arguments.longest_side,
         every=arguments.every,
-        words=tuple(arguments.words),
+        words=tuple(names_in(arguments.words) or ()),
         tracks=arguments.tracks,
     )
     # Checked before masks are made, which may take hours.
