@@ -256,6 +256,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("serve", "a.ogpc", "--up", "w"), "--up is 'w'; expected x, y, z, "),
         (("import", "house.e57", "-o", "house.ogpc"), "-o is house.ogpc; expected a folder name"),
         (("report", "capture", "--quick", "--knob", "mode"), "not allowed with"),
+        (("find", "room.ogpc", "chair"), "expected what `og-pointcloud index FOLDER -o ATLAS` wrote: one scene"),
     ],
 )  # fmt: skip
 def test_bad_use_is_one_line(arguments, text, capsys):

@@ -5,7 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from commands import output_of
+from commands import error_of, output_of
 
 import og_pointcloud as og
 from og_pointcloud.cli import main
@@ -180,7 +180,9 @@ def test_images_that_cannot_be_used_are_named(tmp_path, capsys):
     content = json.loads((tmp_path / "capture/transforms.json").read_text())
     assert [frame["file_path"] for frame in content["frames"]] == ["images/0005_good.jpg"]
     assert len(og.read_points(tmp_path / "capture/points.ply")) == 300
-    assert main(["import", str(tmp_path / "a.e57"), "-o", str(tmp_path / "capture")]) != 0
+    assert "expected a new folder" in error_of(capsys, "import", tmp_path / "a.e57", "-o", tmp_path / "capture")
+    (tmp_path / "a.ogpc").mkdir()
+    assert "expected a file name" in error_of(capsys, "import", tmp_path / "a.e57", "-o", tmp_path / "a.ogpc")
 
 
 def test_a_file_without_usable_images_leaves_nothing_behind(tmp_path):

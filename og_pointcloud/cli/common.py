@@ -145,7 +145,8 @@ def check_outputs(arguments: argparse.Namespace) -> None:
         option = action.option_strings[0]
         if path.suffix not in endings and "" not in endings:  # "": a folder, of any name
             raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
-        check_output(option, path, inputs)
+        is_folder = "" in endings and path.suffix not in filter(None, endings)
+        check_output(option, path, inputs, is_folder=is_folder)
         if path.resolve() in taken:
             raise OgPointcloudError(f"{taken[path.resolve()]} and {option} are both '{path}'; expected different names")
         taken[path.resolve()] = option
@@ -156,11 +157,11 @@ def outputs_of(action: argparse.Action) -> Sequence[str]:
     return getattr(action, "endings", ())
 
 
-def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
-    """Refuse a folder, an input, an existing file in an input folder (except .ogpc files, which are not part of a
-    capture), and a path that cannot be written."""
+def check_output(option: str, path: Path, inputs: Sequence[Path], *, is_folder: bool = False) -> None:
+    """Refuse a folder, unless one is to be written (is_folder), an input, an existing file in an input folder (except
+    .ogpc files, which are not part of a capture), and a path that cannot be written."""
     resolved, sources = path.resolve(), [source.resolve() for source in inputs]
-    if path.is_dir():
+    if path.is_dir() and not is_folder:
         raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
     in_folder = any(source in resolved.parents for source in sources) and path.exists() and path.suffix != ".ogpc"
     if resolved in sources or in_folder:

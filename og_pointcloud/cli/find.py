@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import coordinate, printable
+from og_pointcloud.errors import OgPointcloudError, coordinate, printable
 
 if TYPE_CHECKING:
     from og_pointcloud.collection.collection import Finding
@@ -36,6 +36,11 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.show.findings_page import write_findings
 
     common.check_at_least("--top", arguments.top, 1)
+    if arguments.atlas.suffix == ".ogpc":
+        raise OgPointcloudError(
+            f"ATLAS is '{arguments.atlas}'; expected what `og-pointcloud index FOLDER -o ATLAS` wrote: one scene is "
+            f"asked with og-pointcloud select {arguments.atlas} WORD"
+        )
     corners = None if arguments.within is None else common.numbers(arguments.within, "--within", 6)
     collection = Collection(arguments.atlas, lance=arguments.lance)
     findings = collection.find(
