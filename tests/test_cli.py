@@ -306,11 +306,14 @@ def test_a_demo_leaves_the_captures_of_others(tmp_path, monkeypatch, capsys):
     demo, made = pytest.importorskip("og_pointcloud_room.demo"), []
     monkeypatch.setattr(demo, "run_demo", lambda *given, **options: made.append(given))
     (tmp_path / "capture").mkdir()
-    assert "/capture exists, but no demo ended there" in error_of(capsys, "demo", "-o", tmp_path)
+    assert "/capture is not a demo's; expected a new folder" in error_of(capsys, "demo", "-o", tmp_path)
     assert not made
     (tmp_path / "room.ogpc").touch()
     output_of(capsys, "demo", "-o", tmp_path)
     assert made == [(tmp_path,)], "an earlier demo is made again"
+    (tmp_path / "room.ogpc").unlink()
+    output_of(capsys, "demo", "-o", tmp_path)
+    assert len(made) == 2, "and one that was interrupted"
 
 
 def rewrite_npz(path, **changes):

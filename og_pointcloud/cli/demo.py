@@ -25,12 +25,12 @@ def run(arguments: argparse.Namespace) -> None:
     require_room()
     room = arguments.output / "room.ogpc"
     check_output("-o", room, [])
+    begun = arguments.output / ".demo"
     for folder in (arguments.output / "capture", arguments.output / "photographs"):
-        if folder.exists() and not room.exists():
-            raise OgPointcloudError(
-                f"{folder} exists, but no demo ended there; expected a new folder: name another (-o), or remove what "
-                "an interrupted demo left"
-            )
+        if folder.exists() and not (room.exists() or begun.exists()):
+            raise OgPointcloudError(f"{folder} is not a demo's; expected a new folder: name another (-o)")
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    begun.touch()  # what an interrupted demo leaves is the next one's to replace
     from og_pointcloud_room.demo import run_demo
 
     run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise, photographs=arguments.photographs)

@@ -92,7 +92,7 @@ def open_proposer(text: str, words: Sequence[str] = (), images_before: int | Non
             needs = "tracks" if images_before is not None else "words"
             raise SceneError(
                 f"proposer '{text}' is asked for {needs}{'' if words else ' without words'}; expected words with SAM 3 "
-                "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both or with a folder of id PNGs"
+                "(--proposer sam:facebook/sam3 --words chair,lamp), and tracks with both or with a folder of id PNGs"
             )
         # Imported on demand, like all proposers below: torch takes seconds, and not everybody has it.
         from og_pointcloud.masking.sam3 import FollowedWords, NamedThings
