@@ -192,7 +192,12 @@ def test_masks_of_faces_are_made_again_for_another_lens(tmp_path):
     capture, sides = tmp_path / "c", {"fl_x": 20.0, "fl_y": 20.0, "w": WIDTH, "h": HEIGHT, "k1": 0.0}
     make_capture(capture, 1)
     poses = json.loads((capture / "transforms.json").read_text())
-    for lens, done_before in ((sides, 0), (sides, None), ({**sides, "k1": 0.05}, 0), ({**sides, "fl_x": 22.0}, 0)):
+    for lens, done_before in (
+        (sides, 0),
+        (sides, None),
+        ({**sides, "k1": 0.05}, 0),
+        ({**sides, "k1": 0.05, "fl_x": 22.0}, 0),
+    ):
         content = {**poses, **lens, "camera_model": "OPENCV_FISHEYE"}
         (capture / "transforms.json").write_text(json.dumps(content))
         made = make_masks(capture, QUICK, progress=False)

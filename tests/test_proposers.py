@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -242,6 +244,27 @@ def test_a_folder_by_image_name(tmp_path):
         folder.of("e", (4, 5))
 
 
+def test_threads_read_a_coco_file_once(tmp_path, monkeypatch):
+    image = {"id": 1, "file_name": "a.jpg", "height": 5, "width": 5}
+    (tmp_path / "all.json").write_text(json.dumps({"images": [image], "annotations": []}))
+    read, given = [], ExistingMasks(tmp_path)
+
+    class Cached:
+        """As cached_property from Python 3.12 on, without a lock."""
+
+        def __get__(self, instance, _, make=ExistingMasks._coco.func):
+            if "found" not in vars(self):
+                read.append(instance)
+                time.sleep(0.05)
+                self.found = make(instance)
+            return self.found
+
+    monkeypatch.setattr(ExistingMasks, "_coco", Cached())
+    with ThreadPoolExecutor(4) as pool:
+        assert [len(found) for found in pool.map(lambda _: given.of("a", (5, 5)), range(4))] == [0] * 4
+    assert read == [given]
+
+
 def test_images_of_a_rig_that_share_a_stem_keep_their_own_masks(tmp_path):
     """Two cameras have a 000.png each: their views are called left/000 and right/000."""
     cameras, square = ("left", "right"), [0, 0, 9, 0, 9, 9, 0, 9]
@@ -280,6 +303,12 @@ def test_any_callable():
         assert np.array_equal(proposals.masks, masks)
     scored = Proposals(masks, np.array([0.2, 0.3, 0.4], np.float32))
     assert as_proposals(scored, (120, 160)) is scored
+    listed = CallableProposer(lambda _: [*masks], "mine").propose(image)
+    assert np.array_equal(listed.masks, masks)
+    for none in ([], ()):
+        assert as_proposals(none, (120, 160)).masks.shape == (0, 120, 160)
+    with pytest.raises(SceneError, match=r"masks are \(5, 4\) and \(120, 160\); expected all of \(120, 160\)"):
+        as_proposals([*masks, masks[0, :5, :4]], (120, 160))
     with pytest.raises(SceneError, match="expected the same"):
         as_proposals(masks, (5, 5))
     with pytest.raises(SceneError, match="expected Proposals, bool"):

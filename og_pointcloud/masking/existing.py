@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
+_READING_COCO = Lock()
+"""A file is read once, not once in each thread: from Python 3.12 on, cached_property does not see to it."""
 MAX_MASKS_PX = 1 << 33
 """Total pixels of all masks of one image: more are refused before allocation."""
 
@@ -38,8 +41,13 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     """The result of a user's function as proposals for an image of ``shape`` (H, W).
 
     It may return Proposals; bool (M, H, W), which get the score 1; or an integer id map (H, W), negative outside every
-    mask, or 0 there if no id is negative.
+    mask, or 0 there if no id is negative. An empty list has no mask.
     """
+    if isinstance(given, (list, tuple)):
+        sizes = {np.shape(mask) for mask in given}
+        if len(sizes) > 1:
+            raise SceneError(f"masks are {' and '.join(map(str, sorted(sizes)))}; expected all of {shape}")
+        given = np.array(given) if given else np.zeros((0, *shape), np.bool_)
     masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
     if masks.shape[-2:] != shape:
         raise SceneError(f"masks are {masks.shape}, their image is {shape}; expected the same (H, W)")
@@ -141,7 +149,9 @@ class ExistingMasks:
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
         # Views are named by stem, or by a path below a folder that may be part of COCO's paths.
-        alike = self._coco.get(image_name.rsplit("/", 1)[-1], {})
+        with _READING_COCO:
+            coco = self._coco
+        alike = coco.get(image_name.rsplit("/", 1)[-1], {})
         named = [path for path in alike if f"/{path}".endswith(f"/{image_name}")] or [*alike]
         if len(named) == 1:
             return _resized(_from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'"), shape)

@@ -12,6 +12,7 @@ import json
 import shutil
 import time
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
@@ -81,10 +82,11 @@ def make_masks(
     used = set(list(dict.fromkeys(photograph.path for photograph in photographs))[:: settings.every])
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate)
+    _refuse_name(chosen)
     _refuse_foreign(target, overwrite)
     # Names of work files encode everything that determines their contents, so that existing ones can be reused.
     work = target / WORK_FOLDER / _fingerprint(settings)
-    tasks = [ImageTask(each, work / f"{_digest([each.name, *_state(each.file)])}.npz") for each in chosen]
+    tasks = [ImageTask(each, work / f"{_digest(_state_of(each))}.npz") for each in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
     made, done_before = None if overwrite else _made_before(target, tasks, key), len(tasks)
     if made is None:
@@ -118,12 +120,29 @@ def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], s
     return names
 
 
+def _refuse_name(chosen: Sequence[Photograph]) -> None:
+    """OgPointcloudError for an image whose features would replace the name of their encoder."""
+    for photograph in chosen:
+        if photograph.name == "feature_space":
+            raise OgPointcloudError(
+                f"{photograph.file} has the name by which {FEATURES_NAME} states the encoder; expected another one: "
+                "rename the image, in the pose file too"
+            )
+
+
 def _fingerprint(settings: MaskSettings) -> str:
     """A name for settings and the user's masks or code that they refer to: other work files are not reused."""
     of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
     given = sorted(settings.folder.rglob("*")) if settings.folder else user_source(place) if kind == "python" else []
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
+
+
+def _state_of(photograph: Photograph) -> list[Any]:
+    """What decides the pixels of a photograph. Those of a face depend on the lens."""
+    face = photograph.face
+    cameras = [] if face is None else [[of.width, of.height, *of.intrinsics] for of in (face.camera, face.whole)]
+    return [photograph.name, *_state(photograph.file), *cameras, *([asdict(face.lens)] if face else [])]
 
 
 def _state(file: Path) -> tuple[str, int, int]:
@@ -200,6 +219,8 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
     folder.mkdir(parents=True, exist_ok=True)
     # First, and without a key: after a kill from here on, the next run recognizes the folder as ours but incomplete.
     _write_made(target, settings, tasks)
+    # Their rows belong to the masks that are replaced here: until the end the capture is without any.
+    (target / FEATURES_NAME).unlink(missing_ok=True)
     features: dict[str, Any] = {}
     space, masks = UNKNOWN_SPACE, 0
     for task in tasks:
@@ -210,8 +231,11 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
             features[name + TRACKS] = work["tracks"]
         # 16 bit: 0 outside every mask, else the feature row + 1
         write_png(folder / f"{name}.png", (work["ids"] + 1).astype(np.uint16))
-    with replacing(target / FEATURES_NAME) as file:
-        np.savez(file, feature_space=np.array(space), **features)
+    with replacing(target / FEATURES_NAME) as file, zipfile.ZipFile(file, "w") as archive:
+        # Not numpy.savez: it would take an image called "file" for its own argument.
+        for name, array in {"feature_space": np.array(space), **features}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
     return masks, space
 
 
@@ -242,4 +266,5 @@ def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) 
             content["frames"] = [frame for frame in frames if frame["file_path"].replace("\\", "/") in kept]
             write_json(place, content)
         elif not place.exists():
+            place.unlink(missing_ok=True)  # a link to a capture that was moved
             place.symlink_to(source)
