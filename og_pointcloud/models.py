@@ -62,6 +62,12 @@ def home_folder() -> Path:
         return Path("/nonexistent")
 
 
+def model_folder(name: str | os.PathLike[str]) -> Path | None:
+    """A model's folder, by its path or by OWNER/MODEL as last fetched; None if there is none."""
+    folder = Path(name).expanduser()
+    return folder if folder.is_dir() else fetched_model(str(name))
+
+
 def fetched_model(name: str) -> Path | None:
     """The folder of OWNER/MODEL as last fetched; None if it was not fetched, or the name has another form."""
     if not MODEL_NAME.fullmatch(name):

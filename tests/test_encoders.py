@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -41,6 +42,16 @@ def test_preprocessing_is_that_of_the_models_own_processor(family, side):
     levels = np.abs(ours.pixels(square) - expected) * 255 * np.array(ours.std)[:, None, None]
     assert levels.max() < 1.01, "one level of 255 at most"
     assert (levels > 0.5).mean() < 0.005
+
+
+@pytest.mark.parametrize("file", ["preprocessor_config.json", "processor_config.json"])
+def test_preprocessing_is_read_from_either_file_of_transformers(tmp_path, file):
+    pytest.importorskip("torch")
+    clip = pytest.importorskip("og_pointcloud.masking.clip")
+    config = SimpleNamespace(model_type="siglip", vision_config=SimpleNamespace(image_size=32))
+    stated = {"image_mean": [0.4] * 3, "image_std": [0.2] * 3, "resample": 2, "rescale_factor": 1 / 255}
+    (tmp_path / file).write_text(json.dumps({"image_processor": stated} if file.startswith("processor") else stated))
+    assert clip.preprocessing_of(tmp_path, config) == Preprocessing(32, (0.4,) * 3, (0.2,) * 3, "bilinear")
 
 
 # Mask encoders

@@ -16,6 +16,7 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
+from og_pointcloud.evaluate.scannet import read_truth
 from og_pointcloud.formats.ply import write_ply
 
 WALL, FLOOR, CHAIR = 1, 2, 5
@@ -190,6 +191,12 @@ def test_labels_that_are_not_nyu40_are_one_error(scannet, capsys):
     folders = ("--predictions", scannet / "p", "--text-features", scannet / "w.npz")
     line = error_of(capsys, "eval", "scannet", scannet / "raw", *folders)
     assert "labels span 1..1191; expected NYU40" in line
+
+
+def test_ids_that_scannet_left_by_mistake_are_of_no_class(tmp_path):
+    write_labels(tmp_path, "scene0270_00", np.zeros((3, 3)), [WALL, 50, 149])
+    (file,) = tmp_path.rglob("*.labels.ply")
+    assert read_truth(file)[1].tolist() == [WALL, 0, 0]
 
 
 def test_points_that_lie_in_one_place_count_each(scannet):

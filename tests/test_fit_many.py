@@ -17,6 +17,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.collection import fit_many as module
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.fitting.tasks import LocalWorkers, Share, dask_executor, share_here
+from og_pointcloud.fitting.tasks import LocalWorkers, Share, dask_executor, run_tasks, share_here
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.settings import FitSettings
 
@@ -46,6 +47,17 @@ def captures(tmp_path_factory) -> list[Path]:
     """Of 3 and 4 views, so that every file is another."""
     folder = tmp_path_factory.mktemp("captures")
     return [write_tiny_capture(folder / f"capture{views}", views).folder for views in (3, 4)]
+
+
+def test_a_worker_that_dies_is_one_error():
+    def died(*_):
+        future = Future()
+        future.set_exception(BrokenProcessPool("terminated abruptly"))
+        return future
+
+    executor = SimpleNamespace(submit=died)
+    with pytest.raises(OgPointcloudError, match=r"a worker died, .* expected workers that finish their tasks"):
+        run_tasks(executor, Journal(progress=False), abs, [1, 2], "tasks")
 
 
 def test_the_output_is_a_folder(captures, tmp_path):

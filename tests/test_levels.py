@@ -69,11 +69,10 @@ def literal(said: Proposals, preference: float):
     used = [x for k in kept if parents[k] is None for x in chosen(k)]
     used.sort(key=kept.index)
     result = np.full(said.masks.shape[1:], -1)
-    for k in reversed(used):
-        result[said.masks[k]] = k
     for k in used:
-        if (result == k).sum() < VISIBLE_SHARE * said.masks[k].sum():
-            result = np.where(result == k, -1 - len(said), result)
+        free = said.masks[k] & (result == -1)
+        if free.sum() >= VISIBLE_SHARE * said.masks[k].sum():
+            result[free] = k
     shown = [k for k in kept if (result == k).any()]
     return sum(((result == k) * (rank + 1) for rank, k in enumerate(shown)), np.full(result.shape, -1))
 
@@ -102,6 +101,13 @@ def test_scores_decide_where_masks_overlap():
     assert np.array_equal(first == 1, b & ~both)
     assert np.array_equal(second == 0, b)
     assert np.array_equal(second == 1, a & ~both)
+
+
+def test_a_mask_that_is_mostly_hidden_hides_nothing():
+    best, hidden, behind = rectangle(0, 0, 10, 16), rectangle(0, 4, 10, 20), rectangle(0, 17, 10, 40)
+    settled = settle(proposals((best, 0.99), (hidden, 0.95), (behind, 0.9)), "large")
+    assert np.array_equal(settled == 0, best)
+    assert np.array_equal(settled == 1, behind)
 
 
 @pytest.mark.parametrize("seed", range(6))

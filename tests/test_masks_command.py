@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from scenes import write_image, write_ply
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.masking.encode import DEMO_FOLDER
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
@@ -72,6 +74,23 @@ def test_words_are_a_list_like_any_other(tmp_path, monkeypatch):
         assert main(["masks", *line]) == 2, "it ends where masks are made"
     assert [folder for folder, *_ in asked] == [tmp_path, tmp_path]
     assert [settings.words for _, settings, _ in asked] == [("red chair", "lamp"), ()]
+
+
+def test_masks_are_made_again_where_the_encoder_behind_a_path_has_changed(tmp_path):
+    make_capture(tmp_path / "c")
+    encoder, settings = tmp_path / "encoder", MaskSettings(encoder=str(tmp_path / "encoder"))
+    shutil.copytree(DEMO_FOLDER / "image", encoder)
+
+    def made_by(name):
+        manifest = json.loads((encoder / "manifest.json").read_text())
+        if name != manifest["feature_space"]:
+            (encoder / "manifest.json").write_text(json.dumps({**manifest, "feature_space": name}))
+        made = make_masks(tmp_path / "c", settings, progress=False)
+        return made.feature_space, made.done_before
+
+    assert made_by("first/one") == ("first/one", 0)
+    assert made_by("second/one") == ("second/one", 0)
+    assert made_by("second/one") == ("second/one", 4)
 
 
 def test_a_capture_gets_masks_that_can_be_read(tmp_path):

@@ -70,12 +70,15 @@ def test_free_memory_ends_at_the_limit_of_a_container(tmp_path: Path, monkeypatc
     (tmp_path / "max").write_text("70000000\n")
     (tmp_path / "current").write_text("20000000\n")
     (tmp_path / "none").write_text("max\n")
-    missing = (str(tmp_path / "missing"), str(tmp_path / "missing"))
-    limits = (missing, (str(tmp_path / "none"), str(tmp_path / "current")))
+    folder, entry = str(tmp_path), "inactive_file "
+    limits = ((folder, "missing", "missing", entry), (folder, "none", "current", entry))
     monkeypatch.setattr(memory_module, "CGROUPS", limits)
     assert free_memory() > 50_000_000
-    monkeypatch.setattr(memory_module, "CGROUPS", (*limits, (str(tmp_path / "max"), str(tmp_path / "current"))))
+    monkeypatch.setattr(memory_module, "CGROUPS", (*limits, (folder, "max", "current", entry)))
     assert free_memory() == 50_000_000
+    # Files that the system keeps in memory as long as nobody needs it count as used there.
+    (tmp_path / "memory.stat").write_text("anon 1000000\ninactive_file 15000000\n")
+    assert free_memory() == 65_000_000
 
 
 def test_memory_in_use_grows_with_an_array() -> None:

@@ -63,6 +63,12 @@ def result(tmp_path):
     return tmp_path / "run"
 
 
+def test_a_plain_cloud_is_refused(result, tmp_path):
+    write_ply(tmp_path / "plain.ply", {"vertex": join_columns(dict.fromkeys("xyz", np.zeros(COUNT)))})
+    with pytest.raises(SceneError, match=r"plain.ply is a plain cloud; expected the trained Gaussians of the run"):
+        read_opengaussian(tmp_path / "plain.ply", result / "cluster_lang.npz")
+
+
 def test_leaves_become_instances(tmp_path):
     xyz, opacity = write_result(tmp_path)
     cloud = read_opengaussian(tmp_path, feature_space="a space")

@@ -114,6 +114,23 @@ def test_blend_has_the_gradient_of_a_dense_product(balls: Balls) -> None:
     torch.testing.assert_close(gradient, dense.T @ pull)
 
 
+def test_a_training_draws_no_clusters_of_the_one_before(balls: Balls) -> None:
+    """The same views, drawn for two trainings in turn: the second is as if they were drawn for it alone."""
+    settings = replace(SHORT, fine_alone=True)
+    raw = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
+
+    def drawn() -> rendered_views.RenderedViews:
+        return rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, settings, whole=False)
+
+    used = drawn()
+    paper.train_codebook(used, raw, settings)
+    assert any(cluster >= 0 for _, _, cluster in used._kept)
+    run = paper.TrainingRun(seed=1)
+    again, alone = (paper.train_codebook(source, raw, settings, run) for source in (used, drawn()))
+    np.testing.assert_array_equal(again.leaf, alone.leaf)
+    np.testing.assert_array_equal(again.centers, alone.centers)
+
+
 def test_all_tensors_lie_on_the_device_that_the_settings_name(balls: Balls) -> None:
     """What is made without naming a device goes to another one here, where nothing can be computed with it."""
     settings = replace(SHORT, device="cpu", fine_alone=True)

@@ -240,8 +240,20 @@ def test_a_folder_by_image_name(tmp_path):
     assert polygon.masks[0].mean() == pytest.approx(31 * 41 / 120 / 160, rel=0.1)
     assert len(folder.of("d", (4, 5))) == 0
     assert len(folder.of("rgb/c", (60, 80))) == 1
-    with pytest.raises(SceneError, match="no masks for image 'e'"):
-        folder.of("e", (4, 5))
+    assert len(folder.of("left/rgb/c", (60, 80))) == 1
+    for another in ("e", "left/c", "left/d"):  # the path in the file names another camera, or none
+        with pytest.raises(SceneError, match=f"no masks for image '{another}'"):
+            folder.of(another, (4, 5))
+
+
+def test_a_function_may_return_tensors():
+    torch = pytest.importorskip("torch")
+    masks = np.arange(2 * 4 * 5).reshape(2, 4, 5) % 3 == 0
+    for answer in (torch.from_numpy(masks), [torch.from_numpy(mask) for mask in masks]):
+        assert np.array_equal(as_proposals(answer, (4, 5)).masks, masks)
+    # As of a GPU: nothing that numpy reads by itself.
+    with pytest.raises(SceneError, match="expected"):
+        as_proposals(torch.zeros(2, 4, 5, dtype=torch.bool, device="meta"), (4, 5))
 
 
 def test_threads_read_a_coco_file_once(tmp_path, monkeypatch):

@@ -54,6 +54,12 @@ def test_classes_may_be_unsigned(tmp_path, kind):
         read_truth(tmp_path)
 
 
+def test_a_class_is_named_once(tmp_path):
+    np.savez(tmp_path / "gt.npz", cls=np.array([0, 1, 2]), names=np.array(["cup", "cup", "pot"]))
+    with pytest.raises(SceneError, match="a name occurs twice in names; expected each class once"):
+        read_truth(tmp_path)
+
+
 def test_instances_of_the_truth_are_read_and_checked(tmp_path):
     entries = {"cls": np.array([0, 1]), "names": np.array(NAMES)}
     np.savez(tmp_path / "gt.npz", **entries)

@@ -37,6 +37,8 @@ SCENES = tuple(f"scene{number:04}_00" for number in (0, 62, 70, 97, 140, 200, 34
 MIN_OPACITY = 0.1
 """Points of fainter Gaussians are ignored (see above)."""
 MAX_NYU40_ID = 40
+STRAY_IDS = (50, 149)
+"""Of no class, in three scenes of ScanNet v2 (scene0270_00, scene0270_02, scene0384_00)."""
 
 
 def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -46,6 +48,7 @@ def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]
     if vertices is None or "label" not in (vertices.dtype.names or ()):
         raise SceneError(f"{file} has no vertices with a property 'label'; expected ScanNet's *_vh_clean_2.labels.ply")
     labels = vertices["label"].astype(np.int64)
+    labels[np.isin(labels, STRAY_IDS)] = 0
     if len(labels) and not 0 <= labels.min() <= labels.max() <= MAX_NYU40_ID:
         raise SceneError(
             f"{file}: labels span {labels.min()}..{labels.max()}; expected NYU40 ids 0..{MAX_NYU40_ID}: take the "

@@ -75,6 +75,8 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path}: cls is {cls.dtype} {cls.shape}{reach}, names {names.dtype} {names.shape}; expected whole "
             "numbers (n,) that index the names, and strings (L,)"
         )
+    if len(set(names.tolist())) < len(names):
+        raise SceneError(f"{path}: a name occurs twice in names; expected each class once: merge the two classes")
     cls = cls.astype(np.int64)  # of unsigned numbers, -1 is not one
     for name in POINT_ARRAYS:
         if name in entries and entries[name].shape != cls.shape:

@@ -22,10 +22,11 @@ UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 MIN_MEMORY_BYTES = 64 * 10**6
 """Less memory than this is treated as a mistyped unit: importing the libraries of a fit takes more."""
 CGROUPS = (
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+    ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file "),
+    ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file "),
 )
-"""Files with a container's limit and use of memory, in bytes: of control groups version 2, and version 1."""
+"""Of control groups version 2, and version 1: the folder, its files with a container's limit and use of memory, in
+bytes, and the entry of its memory.stat with the cached files among these, which are given up when memory is needed."""
 
 
 def parse_memory(text: str) -> int:
@@ -45,17 +46,18 @@ def parse_memory(text: str) -> int:
 def free_memory() -> int:
     """Bytes that this process could still take: what the machine has free, or what its container allows."""
     free = [_available()]
-    for limit, used in CGROUPS:
+    for folder, limit, used, cached in CGROUPS:
         try:
-            free.append(max(0, int(Path(limit).read_text()) - int(Path(used).read_text())))
+            most, taken = (int(Path(folder, name).read_text()) for name in (limit, used))
         except (OSError, ValueError):  # no such container, or no limit ("max")
             continue
+        free.append(max(0, most - max(0, taken - _entry(f"{folder}/memory.stat", cached))))
     return min(free)
 
 
 def _available() -> int:
     """Bytes available without swapping, as far as the system reports them."""
-    if available := _proc_bytes("/proc/meminfo", "MemAvailable:"):
+    if available := 1024 * _entry("/proc/meminfo", "MemAvailable:"):
         return available
     try:  # no Linux: assume most of the installed memory
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4
@@ -63,13 +65,13 @@ def _available() -> int:
         return 4 * 10**9
 
 
-def _proc_bytes(file: str, entry: str) -> int:
-    """Bytes that an entry of a file under /proc gives; 0 where there is none."""
+def _entry(file: str, entry: str) -> int:
+    """The number after an entry of a file of the system; 0 where there is none."""
     try:
         lines = Path(file).read_text().splitlines()
     except OSError:
         return 0
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(entry)), 0)
+    return next((int(line.split()[1]) for line in lines if line.startswith(entry)), 0)
 
 
 def memory_in_use() -> int:
@@ -82,7 +84,7 @@ def memory_in_use() -> int:
 
 def peak_memory() -> int:
     """The most memory that this process has held, in bytes; 0 where the system does not tell."""
-    return _proc_bytes("/proc/self/status", "VmHWM:")
+    return 1024 * _entry("/proc/self/status", "VmHWM:")
 
 
 def memory_left(limit: int | None) -> int:

@@ -78,9 +78,10 @@ def read_opengaussian(
     """
     ply, clusters = _find_result(Path(result), None if cluster_lang is None else Path(cluster_lang))
     points = read_points(ply)
+    if points.opacity is None:
+        raise SceneError(f"{ply} is a plain cloud; expected the trained Gaussians of the run, its point_cloud.ply")
     with naming(clusters):
         leaves = _read_leaves(clusters, len(points))
-    assert points.opacity is not None
     kept = points.opacity >= min_opacity
     if not kept.any():
         raise SceneError(

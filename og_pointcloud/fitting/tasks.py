@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
@@ -69,16 +69,22 @@ def share_here(otherwise: Share) -> Share:
 def run_tasks(
     executor: Executor | None, journal: Journal, function: Callable[[Item], Result], items: Sequence[Item], name: str
 ) -> list[Result]:
-    """The function's value for each item, in order: computed here, one after another, or by an executor's workers."""
+    """The function's value for each item, in order: computed here, one after another, or by an executor's workers.
+    OgPointcloudError if a worker of `concurrent.futures` dies."""
     if executor is None:
         return [function(item) for item in journal.steps(items, name)]
     futures = [executor.submit(_with_share, function, item) for item in items]
     try:
         return [future.result() for future in journal.steps(futures, name)]
-    except BaseException:  # Ctrl-C too: cancel what has not begun
+    except BaseException as error:  # Ctrl-C too: cancel what has not begun
         for future in futures:
             future.cancel()
-        raise
+        if not isinstance(error, BrokenExecutor):
+            raise
+        raise OgPointcloudError(
+            "a worker died, as one does that runs out of memory; expected workers that finish their tasks: take fewer "
+            "workers or more memory (with a work folder, the next run goes on after the tasks that were finished)"
+        ) from error
 
 
 def _with_share(function: Callable[[Item], Result], item: Item) -> Result:

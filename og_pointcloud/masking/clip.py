@@ -98,12 +98,14 @@ class TransformersModel:
 
 
 def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
-    """From preprocessor_config.json, else that of the family's published models. config: the model's."""
-    stated = read_config(Path(folder), "preprocessor_config.json")
+    """From the folder's preprocessor_config.json or processor_config.json, else that of the family's published models.
+    config: the model's."""
+    stated = read_config(Path(folder), "preprocessor_config.json", "processor_config.json")
+    stated = stated.get("image_processor", stated)
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
         raise OgPointcloudError(
-            f"{folder}/preprocessor_config.json: resample is {number!r:.20}, rescale_factor {factor!r:.20}; expected "
+            f"{folder}: of its image processor, resample is {number!r:.20}, rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
     mean, std = CLIP_MEAN_STD if config.model_type == "clip" else SIGLIP_MEAN_STD

@@ -71,17 +71,21 @@ def open_encoder(name: StrPath, features: str = "crops") -> MaskEncoder:
     return DenseEncoder(model)
 
 
-def _open_model(name: StrPath) -> ImageModel:
+def encoder_folder(name: StrPath) -> Path | None:
+    """The folder that `open_encoder` opens, None if there is none: a folder by its path, then by its stated feature
+    space, then downloads of other tools."""
     if name == "demo":
-        return OnnxModel(DEMO_FOLDER / "image")
-    # A folder by its path, then by its stated feature space, then downloads of other tools.
-    path = Path(name).expanduser()
-    if path.exists():
-        return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path)
-    if exported := ENCODER.find(str(name), model_folders()):
-        return OnnxModel(exported)
-    if fetched := fetched_model(str(name)):
-        return _transformers_model(fetched, str(name))
+        return DEMO_FOLDER / "image"
+    if (path := Path(name).expanduser()).exists():
+        return path
+    return ENCODER.find(str(name), model_folders()) or fetched_model(str(name))
+
+
+def _open_model(name: StrPath) -> ImageModel:
+    if folder := encoder_folder(name):
+        if ENCODER.feature_space(folder) is not None:
+            return OnnxModel(folder)
+        return _transformers_model(folder, None if Path(name).expanduser().exists() else str(name))
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
         f"no encoder '{name}': it is not a folder, no encoder of that feature space is in {MODELS_VARIABLE} "

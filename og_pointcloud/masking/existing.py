@@ -19,6 +19,7 @@ from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
+from og_pointcloud.scene import numbers_of
 
 _READING_COCO = Lock()
 """A file is read once, not once in each thread: from Python 3.12 on, cached_property does not see to it."""
@@ -44,11 +45,12 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     mask, or 0 there if no id is negative. An empty list has no mask.
     """
     if isinstance(given, (list, tuple)):
-        sizes = {np.shape(mask) for mask in given}
+        given = [numbers_of(mask) for mask in given]
+        sizes = {mask.shape for mask in given}
         if len(sizes) > 1:
             raise SceneError(f"masks are {' and '.join(map(str, sorted(sizes)))}; expected all of {shape}")
         given = np.array(given) if given else np.zeros((0, *shape), np.bool_)
-    masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
+    masks = given.masks if isinstance(given, Proposals) else numbers_of(given)
     if masks.shape[-2:] != shape:
         raise SceneError(f"masks are {masks.shape}, their image is {shape}; expected the same (H, W)")
     if isinstance(given, Proposals):
@@ -152,7 +154,11 @@ class ExistingMasks:
         with _READING_COCO:
             coco = self._coco
         alike = coco.get(image_name.rsplit("/", 1)[-1], {})
-        named = [path for path in alike if f"/{path}".endswith(f"/{image_name}")] or [*alike]
+        # A view's folder tells cameras apart: a path that names another one is of another image.
+        named = [
+            path for path in alike
+            if f"/{path}".endswith(f"/{image_name}") or ("/" in path and f"/{image_name}".endswith(f"/{path}"))
+        ]  # fmt: skip
         if len(named) == 1:
             return _resized(_from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'"), shape)
         if named:

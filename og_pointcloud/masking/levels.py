@@ -98,10 +98,11 @@ def _cut(area_px: DoubleArray, scores: DoubleArray, parent: NDArray[np.intp], pa
 
 
 def _owners(member: NDArray[np.bool_], area_px: DoubleArray, used: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
+    """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first; one that better
+    ones mostly hide owns nothing."""
     owner = np.full(member.shape[1], -1)
-    for mask in used[::-1]:  # the best last, so that it takes shared atoms
-        owner[member[mask]] = mask
-    shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
-    hidden = shown_px < VISIBLE_SHARE * (member @ area_px)
-    return np.where(np.append(hidden, False)[owner], -1, owner)  # the last entry serves -1
+    for mask in used:
+        free = member[mask] & (owner < 0)
+        if area_px[free].sum() >= VISIBLE_SHARE * (member[mask] @ area_px):
+            owner[free] = mask
+    return owner

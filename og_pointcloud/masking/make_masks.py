@@ -31,11 +31,13 @@ from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
+from og_pointcloud.masking.encode import encoder_folder
 from og_pointcloud.masking.existing import user_source
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
+from og_pointcloud.models import model_folder
 
-VERSION = 3
+VERSION = 4
 """Version of the contents of an image's work file; files of other versions are made again."""
 WORK_FOLDER = "masks.work"
 PREVIEW_NAME = "masks_preview.png"
@@ -131,10 +133,12 @@ def _refuse_name(chosen: Sequence[Photograph]) -> None:
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """A name for settings and the user's masks or code that they refer to: other work files are not reused."""
+    """A name for settings and the user's masks, code and models that they refer to: other work files are not reused."""
     of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
     given = sorted(settings.folder.rglob("*")) if settings.folder else user_source(place) if kind == "python" else []
+    models = [encoder_folder(settings.encoder) if settings.encoder else None, model_folder(place) if place else None]
+    given = [*given, *(file for folder in models if folder for file in sorted(folder.rglob("*")))]
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
 

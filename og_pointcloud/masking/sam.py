@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_config, torch
-from og_pointcloud.models import fetched_model
+from og_pointcloud.models import model_folder
 
 CLASSES = {
     "sam": "SamModel",
@@ -67,8 +67,7 @@ def load_sam(name: StrPath, classes: Mapping[str, str]) -> LoadedModel:
 
     SceneError where there is no model of these types, or it cannot be read.
     """
-    folder = Path(name).expanduser()
-    found = folder if folder.is_dir() else fetched_model(str(name))
+    found = model_folder(name)
     if found is None:
         raise SceneError(
             f"no SAM model '{name}'; expected a transformers folder with config.json and weights, or a fetched model: "

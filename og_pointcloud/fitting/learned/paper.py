@@ -238,6 +238,7 @@ def train_codebook(
 
     # Fine: each coarse cluster is a separate part, clustered by features alone from some of its own Gaussians.
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centers))]
+    source.forget_clusters()
     held = _masks_held(source, own, len(centers))
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
     fine = StageHistory("fine codebook", STEPS[settings.schedule][2])

@@ -112,8 +112,8 @@ class RenderedViews:
         """A view with all Gaussians' standard deviations times ``factor``, and only these ``members`` (rows of the
         known Gaussians; None: all); its masks are among those at full size.
 
-        cluster: at least 0, a number for the members: the view is cached under it, so the same number must always mean
-        the same members.
+        cluster: at least 0, a number for the members: the view is cached under it until `forget_clusters`, so the same
+        number must mean the same members.
         """
         key = index, factor, cluster
         if key in self._kept:
@@ -134,6 +134,11 @@ class RenderedViews:
         if rendered.nbytes <= self._room:
             self._kept[key] = rendered
             self._room -= rendered.nbytes
+
+    def forget_clusters(self) -> None:
+        """Drop the cached views of some members alone: another codebook has other clusters."""
+        for key in [key for key in self._kept if key[2] >= 0]:
+            self._room += self._kept.pop(key).nbytes
 
     def _composited(
         self, gaussians: Gaussians, view: View, column: NDArray[np.int32], masks: NDArray[np.int64] | None = None
