@@ -290,6 +290,16 @@ def test_paths_out_of_the_folder_are_looked_for_inside(capture, path):
     assert image.max() > 0, "the black image outside the capture was opened"
 
 
+@pytest.mark.parametrize("root", ["/old/capture/images", "../capture/images", "/images", "../../left/../images"])
+def test_images_of_a_rig_are_told_apart_whatever_leads_to_them(tmp_path, root):
+    for place in ("images/left", "images/right", "images"):  # the last has the same name by chance
+        write_image(tmp_path / place / "000.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    for side in ("left", "right"):
+        assert find_image(tmp_path, f"{root}/{side}/000") == tmp_path / "images" / side / "000.png"
+    assert find_image(tmp_path / "images/left", f"{root}/right/000.png") == tmp_path / "images/left/000.png"
+    assert find_image(tmp_path, "images/up/000.png") is None
+
+
 @pytest.mark.parametrize("path", ["", ".", "./", "images/..", "/"])
 def test_a_path_that_names_no_file_is_no_image_of_the_working_folder(tmp_path, monkeypatch, path):
     monkeypatch.chdir(tmp_path)

@@ -7,6 +7,7 @@ import pytest
 from capture_files import make_world, same_camera, write_colmap_binary, write_colmap_text
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.capture import read_poses
 from og_pointcloud.formats.colmap import find_model, read_images, read_points3d
 from og_pointcloud.formats.lenses import lens_of
 
@@ -127,6 +128,28 @@ def test_damaged_text_names_the_line(tmp_path, name, find, put, message):
     (tmp_path / name).write_text(text.replace(find, put, 1))
     with pytest.raises(SceneError, match=message):
         read_all(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a.png", "IMG (1).png", "a b c.png", "1 2 3 4.png", "a b 1"])
+def test_text_without_lines_of_points_is_refused_whatever_the_names(tmp_path, name):
+    write_colmap_text(tmp_path, make_world())
+    lines = [f"{index} 1 0 0 0 {index} 0 0 1 {name}" for index in range(1, 5)]
+    (tmp_path / "images.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(SceneError, match=r"line 2: found '2 .*expected the line of 2-D points"):
+        read_images(tmp_path)
+    (tmp_path / "images.txt").write_text("\n1.5 2 -1 3.25 4 7\n".join(lines) + "\n")
+    assert [image.path for image in read_images(tmp_path)] == [name] * 4
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_a_larger_model_beside_the_first_is_mentioned(tmp_path, write, recwarn):
+    write(tmp_path / "sparse/0", make_world(count=4))
+    write(tmp_path / "sparse/1", make_world(count=3))
+    assert len(read_poses(tmp_path).names) == 4
+    assert not recwarn
+    write(tmp_path / "sparse/2", make_world(count=9))
+    with pytest.warns(UserWarning, match="sparse/0 has 4 images, but .*sparse/2 has 9.* swap the two folders' names"):
+        assert len(read_poses(tmp_path).names) == 4
 
 
 def test_text_with_a_mark_before_it_and_other_line_ends_is_read(tmp_path):

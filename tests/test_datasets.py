@@ -235,6 +235,71 @@ def test_a_depth_folder_beside_the_images_is_found(tmp_path):
     assert distance_to_surface(read_capture(tmp_path).points.xyz_world).max() < 0.03
 
 
+def as_named(content):
+    """As instant-ngp names depth images."""
+    for frame in content["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path")
+
+
+def unnamed(content):
+    for frame in content["frames"]:
+        frame.pop("depth_file_path")
+
+
+def absent(content):
+    for frame in content["frames"]:
+        frame["depth_path"] = frame.pop("depth_file_path").replace("depths/d", "gone/")
+
+
+@pytest.mark.parametrize("key", ["integer_depth_scale", "depth_unit_scale_factor"])
+@pytest.mark.parametrize("change", [as_named, unnamed, absent])
+def test_the_stated_unit_holds_however_depth_images_are_found(tmp_path, change, key):
+    nerfstudio(tmp_path, **{key: 2e-4, "integer_depth_scale": 2e-4})
+    edit_poses(tmp_path, lambda content: key == "integer_depth_scale" or content.pop("integer_depth_scale"))
+    if change is not as_named:
+        (tmp_path / "depths").rename(tmp_path / "depth")
+        for file in list((tmp_path / "depth").iterdir()):
+            file.rename(file.with_name(file.name[1:]))
+    edit_poses(tmp_path, change)
+    files = depth_files(tmp_path, read_poses(tmp_path))
+    assert list(files) == [str(index) for index in range(COUNT)]
+    np.testing.assert_allclose(files["2"].read().depth, look(room_poses(COUNT)[2], intrinsics=LENS)[0], atol=2e-4)
+    stated, given = fuse_capture(tmp_path), fuse_capture(tmp_path, depth_unit=2.02e-4)
+    assert given.survey.depth == pytest.approx(1.01 * stated.survey.depth, rel=1e-4)
+
+
+def test_the_unit_of_a_distorted_photographs_depth_is_the_stated_one(tmp_path):
+    nerfstudio(tmp_path, integer_depth_scale=2e-4, k1=1e-3)
+    edit_poses(tmp_path, unnamed)
+    (tmp_path / "depths").rename(tmp_path / "depth")
+    (tmp_path / "depth/d0.png").rename(tmp_path / "depth/0.png")
+    depth = depth_files(tmp_path, read_poses(tmp_path))["0"].read().depth
+    assert np.median(depth) == pytest.approx(np.median(look(room_poses(COUNT)[0], intrinsics=LENS)[0]), rel=0.02)
+
+
+def thin(folder, kept):
+    for file in list((folder / "results").iterdir()):
+        if int(file.stem[-6:]) not in kept:
+            file.unlink()
+
+
+def test_images_of_a_thinned_replica_have_the_poses_of_their_numbers(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    write_replica(folder)
+    lines = (folder / "traj.txt").read_text().splitlines(keepends=True)
+    thin(folder, (0, 2, 5))
+    thinned = read_poses(folder)
+    (folder / "traj.txt").write_text("".join(lines[index] for index in (0, 2, 5)))  # thinned with the images
+    for poses in (thinned, read_poses(folder)):
+        assert poses.names == ("frame000000", "frame000002", "frame000005")
+        for image, index in zip(poses.images, (0, 2, 5), strict=True):
+            np.testing.assert_allclose(image.camera.center, room_poses(COUNT)[index][:3, 3], atol=1e-5)
+    (folder / "traj.txt").write_text("".join(lines[:5]))
+    with pytest.raises(SceneError, match=r"3 images in results/ and 5 poses .*line i \(from 0\) for frame i"):
+        read_poses(folder)
+
+
 def test_poses_in_millimeters_with_depth_in_meters_are_doubted(tmp_path):
     nerfstudio(tmp_path)
     content = json.loads((tmp_path / "transforms.json").read_text())

@@ -51,6 +51,32 @@ def test_what_was_not_measured_is_zero(tmp_path):
     assert read(tmp_path / "b.png").depth[0, :5].tolist() == [0, 0, 0, 0, 2]  # the largest number of 16 bits
 
 
+@pytest.mark.parametrize("kind", ["<u2", ">u2", "<i4", "<u4", "<u8"])
+def test_the_largest_number_of_16_bits_is_no_depth_in_any_type(tmp_path, kind):
+    stored = np.full((HEIGHT, WIDTH), 2000, kind)
+    stored[0, :2] = 65535, 65534
+    np.save(tmp_path / "a.npy", stored)
+    assert read(tmp_path / "a.npy").depth[0, :3] == pytest.approx([0, 65.534, 2])
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_the_background_of_renderers_is_no_depth(tmp_path, kind):
+    stored = np.full((HEIGHT, WIDTH), 2.0, kind)
+    stored[0, :2] = 65504, np.float64(1e10).astype(np.float32) if kind != np.float16 else 65504
+    stored[0, 2] = 65000
+    np.save(tmp_path / "a.npy", stored)
+    assert read(tmp_path / "a.npy").depth[0, :4] == pytest.approx([0, 0, float(kind(65000)), 2])
+
+
+def test_a_unit_of_integers_does_not_scale_floats(tmp_path):
+    np.save(tmp_path / "floats.npy", np.full((HEIGHT, WIDTH), 2.0, np.float32))
+    np.save(tmp_path / "integers.npy", np.full((HEIGHT, WIDTH), 4000, np.uint16))
+    for unit, floats in ((None, 2.0), (3.0, 6.0)):
+        keys = {"unit": unit, "integer_unit": 0.0005}
+        assert read(tmp_path / "floats.npy", **keys).depth[0, 0] == floats
+        assert read(tmp_path / "integers.npy", **keys).depth[0, 0] == pytest.approx(2.0)
+
+
 def test_a_smaller_file_scales_its_camera_and_another_shape_is_refused(tmp_path):
     write_depth(tmp_path / "small.png", np.full((HEIGHT // 2, WIDTH // 2), 1.5))
     image = read(tmp_path / "small.png", unit=0.002)

@@ -52,6 +52,33 @@ def test_frames_override_the_top(tmp_path):
     assert second.lens is not None
 
 
+@pytest.mark.parametrize(
+    ("shared", "own", "focal"),
+    [
+        ({"fl_x": 500}, {"camera_angle_x": 1.0}, (32 / np.tan(0.5),) * 2),
+        ({"fl_x": 500, "fl_y": 500}, {"camera_angle_x": 1.0}, (32 / np.tan(0.5),) * 2),
+        ({"camera_angle_x": 0.7, "camera_angle_y": 0.7}, {"fl_x": 90}, (90, 90)),
+        ({"fl_x": 500, "fl_y": 510}, {"fl_x": 90}, (90, 510)),
+        ({"fl_y": 80}, {}, (80, 80)),
+        ({"camera_angle_y": 1.0}, {}, (24 / np.tan(0.5),) * 2),
+        ({"x_fov": 90, "y_fov": 60}, {}, (32, 24 / np.tan(np.pi / 6))),
+    ],
+)
+def test_a_frames_own_focal_length_counts_and_one_serves_for_both_axes(tmp_path, shared, own, focal):
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist(), **own}
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 64, "h": 48, **shared, "frames": [frame]}))
+    camera = read(tmp_path).images[0].camera
+    assert (camera.fx, camera.fy) == pytest.approx(focal)
+
+
+def test_a_unit_without_depth_images_is_not_judged(tmp_path):
+    write_transforms(tmp_path, make_world(), integer_depth_scale=0)
+    assert read(tmp_path).images[0].integer_depth_unit is None
+    edit_poses(tmp_path, lambda content: content["frames"][0].update(depth_file_path="d.png"))
+    with pytest.raises(SceneError, match=r"the depth unit is 0\.0; expected world lengths"):
+        read(tmp_path)
+
+
 def test_blender_takes_its_size_from_the_image(tmp_path):
     world = make_world()
     angle = 2 * np.arctan(0.5 * 200 / 250.0)

@@ -118,6 +118,14 @@ def test_frames_without_a_partner_are_left_out(app):
 
 
 @pytest.mark.filterwarnings("ignore:.*no finite pose")
+@pytest.mark.parametrize(("stamp", "images"), [("10.099", 4), ("10.101", 4), ("10.102", 3)])
+def test_intrinsics_of_arkit_scenes_may_be_named_a_millisecond_off(tmp_path, stamp, images):
+    file = tmp_path / write_arkit_scenes(tmp_path)
+    file.rename(file.with_name(f"4200_{stamp}.pincam"))
+    assert len(read_poses(tmp_path).images) == images
+
+
+@pytest.mark.filterwarnings("ignore:.*no finite pose")
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b"1 2 3", b'{"fx": "x", "intrinsics": [1], "t_00": null}', b"\xff\xfe"]
 )

@@ -144,6 +144,43 @@ def test_chunks_of_one_world_are_read_together_and_others_refused(tmp_path):
     assert len(read(tmp_path, document(metashape(first), disabled)).images) == 3
 
 
+@pytest.mark.parametrize("in_chunk", [False, True])
+def test_components_without_a_common_world_are_refused(tmp_path, in_chunk):
+    placed = transform_of(2.0, np.eye(3), [100.0, 0, 0])
+
+    def components(first, second, enabled="true"):
+        extra = f'<components><component id="0">{first}</component><component id="1">{second}</component></components>'
+        text = metashape(make_world(), extra=extra + placed * in_chunk, component='component_id="0"')
+        return document(text.replace('"0" label="frame_01"', f'"1" enabled="{enabled}" label="frame_01"'))
+
+    for one, other in (("", ""), (placed, ""), ("", placed)):
+        with pytest.raises(SceneError, match=r"2 components of the chunk 'Chunk 1' .*align or merge them, or disable"):
+            read(tmp_path, components(one, other))
+        assert len(read(tmp_path, components(one, other, "false")).images) == 2
+    assert len(read(tmp_path, components(placed, placed)).images) == 3
+
+
+def test_an_equidistant_fisheye_is_a_fisheye(tmp_path):
+    sensors = [SENSOR.format(id=0, type="equidistant_fisheye", terms=TERMS)]
+    assert read(tmp_path, document(metashape(make_world(), sensors=sensors))).images[0].lens.model == "fisheye"
+
+
+def test_repeated_labels_are_told_apart_by_their_groups(tmp_path):
+    world = make_world()
+    world.names = ["a", "a", "b"]
+    text = (
+        document(metashape(world)).replace('<group id="0" label="Group 1" type="folder">', "").replace("</group>", "")
+    )
+    for label in ("left", "right"):
+        text = text.replace("<camera ", f'<group label="{label}"><CAMERA ', 1).replace(
+            "</camera>", "</CAMERA></group>", 1
+        )
+        write_images(tmp_path, [f"{label}/a"])
+    text = text.replace("CAMERA", "camera")
+    assert [image.path for image in read(tmp_path, text).images] == ["left/a", "right/a", "b"]
+    assert read_poses(tmp_path).names == ("left/a", "right/a", "b")
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -163,6 +163,8 @@ def _stated_poses(capture: Path) -> CapturePoses:
         source, frames = file, read_transforms(file, size_of)
     elif (model := colmap.find_model(capture)) is not None:
         source, frames = model, PosedFrames(colmap.read_images(model))
+        if said := colmap.larger_model(model, len(frames.images)):
+            warnings.warn(said, stacklevel=4)
     elif (export := find_photogrammetry(capture)) is not None:
         source, frames = export, read_photogrammetry(export, size_of)
     else:
@@ -365,7 +367,7 @@ def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCl
     if not frames:
         raise SceneError(f"{capture} has no depth images; expected depth/<image stem>.png, or depth_file_path in poses")
     if depth_unit is not None:
-        frames = [replace(frame, depth=replace(frame.depth, unit=depth_unit)) for frame in frames]
+        frames = [replace(frame, depth=replace(frame.depth, unit=depth_unit, integer_unit=None)) for frame in frames]
     return _fused(capture, frames)
 
 
@@ -378,7 +380,8 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
         elif path := find_depth(capture, name):
             # Depth beside a distorted photograph has the same distortion; cube faces have depth images of their own.
             whole = image.face if image.face is not None and not image.face.name else None
-            files[name] = DepthFile(path, whole.whole, lens=whole.lens) if whole else DepthFile(path, image.camera)
+            camera, lens = (whole.whole, whole.lens) if whole else (image.camera, None)
+            files[name] = DepthFile(path, camera, image.depth_unit, lens, image.integer_depth_unit)
     return files
 
 

@@ -8,6 +8,7 @@ Since 3.12 a model may have rigs and frames files. They are not needed: the imag
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 import warnings
@@ -93,6 +94,30 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
     return tuple(images)
 
 
+def larger_model(model: Path, count: int) -> str | None:
+    """A warning where ``sparse/1`` or the like beside ``sparse/0`` has more images than the ``count`` of that, or None;
+    COLMAP numbers its models by the order in which it began them."""
+    others = [folder for folder in model.parent.glob("[0-9]*") if model.name == "0" and folder.name.isdigit()]
+    most, largest = max(((_image_count(folder), folder) for folder in others), default=(0, model))
+    if most <= count:
+        return None
+    return (
+        f"{model} has {count} images, but {largest} has {most}: the photographs were registered in several models, and "
+        f"only {model.name} is read; to use the other, swap the two folders' names"
+    )
+
+
+def _image_count(model: Path) -> int:
+    """Images of a model, by its file's head or lines."""
+    file = _file(model, "images")
+    if file is None:
+        return 0
+    with file.open("rb") as stream:
+        if file.suffix == ".bin":
+            return int.from_bytes(stream.read(8), "little")
+        return sum(not line.startswith(b"#") for line in stream) // 2
+
+
 def read_points3d(model: Path) -> tuple[DoubleArray, NDArray[np.uint8]]:
     """World coordinates (n, 3) float64 and colors (n, 3) uint8 of the triangulated points."""
     return _records(model, "points3D", _points_binary, _points_text)
@@ -159,11 +184,19 @@ def _images_text(file: Path) -> Iterator[ImageRecord]:
         _, camera_id = _numbers(int, [words[0], words[8]], place)
         yield _numbers(float, words[1:8], place), camera_id, words[9].strip()
         number, observations = next(lines, (0, ""))
-        if len(observations.split(None, 10)) == 10:  # 2-D points come in threes, an image's line has ten words
+        if not _is_in_threes(observations.split()):
             raise SceneError(
                 f"{file}, line {number}: found '{observations.strip():.60}'; expected the line of 2-D points that "
                 "follows each image, empty if it has none: export it again"
             )
+
+
+def _is_in_threes(words: list[str]) -> bool:
+    """Whether they are a line of 2-D points, x y id each; an image's line has its name from the tenth word on."""
+    try:
+        return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in [*words[:12], *words[-1:]])
+    except ValueError:
+        return False
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str, Iterator[tuple[int, str]]]]:

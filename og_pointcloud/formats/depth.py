@@ -2,7 +2,8 @@
 
 16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored integers are millimeters in a world of meters unless the data
 set states otherwise; stored floats are world lengths. The largest 16-bit number, 65535, is not a depth, like 0: sensors
-write it for "no reading" or "too far".
+write it for "no reading" or "too far". Nor are 1e10 and 65504 as floats: renderers write them for the background, the
+second as half floats.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ from og_pointcloud.scene import Camera
 DEPTH_FOLDERS = ("depth", "depths", "depth_images")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 MILLIMETER = 1e-3
+NO_READING = 65535
+"""Largest whole number of 16 bits, also where a file has widened them."""
+BACKGROUND, HALF_BACKGROUND = 1e10, 65504
+"""Blender's depth where a ray meets nothing, and the largest half float, which it becomes."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +45,14 @@ class DepthFile:
     """A depth image, read on demand.
 
     camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths per
-    stored step; None: depends on the type (`lengths`).
+    stored step; None: depends on the type (`lengths`). integer_unit: that of whole numbers, if it differs.
     """
 
     path: Path
     camera: Camera
     unit: float | None = None
     lens: Lens | None = None
+    integer_unit: float | None = None
 
     def read(self) -> DepthImage:
         """Decode, scale and undistort; for a lens that no pinhole can show, only the front face.
@@ -56,7 +62,8 @@ class DepthFile:
         stored = _stored(self.path)
         height, width = stored.shape
         require_scaled(f"{self.path} is", (width, height), (self.camera.width, self.camera.height))
-        depth = lengths(stored, self.unit)
+        of_integers = stored.dtype.kind in "iu" and self.integer_unit is not None
+        depth = lengths(stored, self.integer_unit if of_integers else self.unit)
         camera = self.camera.resized(width, height)
         if self.lens is None:
             return DepthImage(depth, camera)
@@ -78,14 +85,13 @@ class DepthFrame:
 
 def lengths(stored: NDArray, unit: float | None = None) -> NDArray[np.float32]:
     """(H, W) float32 world lengths of stored depths, 0 where nothing was measured: at 0, negative numbers, NaN,
-    infinity, and the largest uint16. unit: world lengths per stored step; None: 1/1000 for integers, which are
-    millimeters in a world of meters, and 1 for floats."""
+    infinity, NO_READING of integers and the backgrounds of floats. unit: world lengths per stored step; None: 1/1000
+    for integers, which are millimeters in a world of meters, and 1 for floats."""
     whole = stored.dtype.kind in "iu"
     with np.errstate(invalid="ignore", over="ignore"):  # NaN and overflows count as unmeasured
         depth = stored.astype(np.float32) * np.float32((MILLIMETER if whole else 1.0) if unit is None else unit)
         measured = np.isfinite(depth) & (depth > 0)
-    if stored.dtype == np.uint16:
-        measured &= stored != np.iinfo(np.uint16).max
+        measured &= (stored != NO_READING) if whole else (stored != HALF_BACKGROUND) & (stored < BACKGROUND)
     return np.where(measured, depth, np.float32(0))
 
 

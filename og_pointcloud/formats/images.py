@@ -56,18 +56,17 @@ def find_image(capture: Path, path: str) -> Path | None:
     """The file that ``path`` in a pose file refers to, or None.
 
     The path is tried inside the capture folder, then inside its image folders; each also with an image suffix added. A
-    path that leads out of the capture folder is never opened: its file name is searched for in the image folders.
+    path that leads out of the capture folder is never opened: the longest of its endings that is found is used.
     """
     inside = posixpath.normpath(path)
-    if inside.startswith(("/", "..")):  # absolute paths of the machine that wrote the file, or worse
-        inside = posixpath.basename(inside)
-    if inside in ("", "."):
-        return None
-    for folder in ("", *IMAGE_FOLDERS):
-        file = capture / folder / inside
-        candidates = (file, *(file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES))
-        if found := next((candidate for candidate in candidates if os.path.isfile(candidate)), None):
-            return found
+    led_out = inside.startswith(("/", ".."))  # absolute paths of the machine that wrote the file, or worse
+    parts = [part for part in inside.split("/") if part not in ("", ".", "..")]
+    for first in range(len(parts) if led_out else min(1, len(parts))):
+        for folder in ("", *IMAGE_FOLDERS):
+            file = capture.joinpath(folder, *parts[first:])
+            candidates = (file, *(file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES))
+            if found := next((candidate for candidate in candidates if os.path.isfile(candidate)), None):
+                return found
     return None
 
 

@@ -1,12 +1,14 @@
 """``transforms.json`` of nerfstudio, instant-ngp and Blender: camera-to-world, OpenGL axes (x right, y up, z back).
 
 Intrinsics are at the top level or in a frame, which overrides it: ``fl_x fl_y cx cy w h`` in pixels, or
-``camera_angle_x`` (radians over the width), with the principal point in the middle unless given. Of the splits that
-Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like describe the
-rendering box of instant-ngp, not the poses, and are ignored.
+``camera_angle_x`` (radians over the width) or ``x_fov`` (degrees), with the principal point in the middle unless given.
+A focal length of one axis holds for both. Of the splits that Blender writes, ``transforms_train.json`` is read.
+``aabb_scale``, ``scale``, ``offset`` and the like describe the rendering box of instant-ngp, not the poses, and are
+ignored.
 
-A frame's ``depth_file_path`` names its depth image inside the capture folder; stored integers are millimeters
-unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` gives another unit.
+A frame's ``depth_file_path``, or ``depth_path`` (instant-ngp; a file that is absent is skipped), names its depth image
+inside the capture folder; stored integers are millimeters unless ``integer_depth_scale`` (instant-ngp, integers only)
+or ``depth_unit_scale_factor`` gives another unit. The units hold for images in ``depth/`` too.
 
 ``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to
 ``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``.
@@ -34,7 +36,8 @@ TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
 SPHERICAL_MODELS = ("EQUIRECTANGULAR",)
-DEPTH_UNIT_KEYS = ("integer_depth_scale", "depth_unit_scale_factor")
+DEPTH_KEYS = ("depth_file_path", "depth_path")
+FOCAL_KEYS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -59,10 +62,13 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         with naming(f"{file}, frame '{path:.80}'"):
             camera_to_world = _matrix(frame, "transform_matrix")
             if np.isfinite(camera_to_world).all():  # trackers write NaN when they get lost
-                keys = {**shared, **frame}
+                keys = _overridden(shared, frame)
                 camera = _camera(keys, inverse(camera_to_world * OPENGL_SIGNS), partial(image_size, path))
                 lens = _lens(keys)
-                images.append(PosedImage(path, camera, lens, _depth(file.parent, keys, camera, lens)))
+                units = _depth_unit(keys, "depth_unit_scale_factor"), _depth_unit(keys, "integer_depth_scale")
+                depth_path = _depth_path(file.parent, keys, lens)
+                depth = depth_path and DepthFile(depth_path, camera, units[0], lens, units[1])
+                images.append(PosedImage(path, camera, lens, depth, None, *units))
             else:
                 dropped.append(path)
     if not images:
@@ -72,6 +78,13 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
     ply = shared.get("ply_file_path")
     ply_file_path = ply.replace("\\", "/") if isinstance(ply, str) and ply else None
     return PosedFrames(tuple(images), tuple(dropped), ply_file_path)
+
+
+def _overridden(shared: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """The keys of a frame: its own, and the shared ones. A focal length of its own also replaces a shared angle."""
+    own = [pair for pair in FOCAL_KEYS if any(frame.get(key) is not None for key in pair)]
+    replaced = {key for pair in FOCAL_KEYS if own and pair not in own for key in pair}
+    return {**{key: value for key, value in shared.items() if key not in replaced}, **frame}
 
 
 def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
@@ -97,15 +110,15 @@ def _camera(
     width, height = image_size() if w is None or h is None else (round(w), round(h))
     if _camera_model(keys) in SPHERICAL_MODELS:  # fl_x is ignored: writers disagree on its meaning for a sphere
         return spherical_camera(width, height, world_to_camera)
-    fx = _focal(keys, "x", width)
-    fy = _focal(keys, "y", height)  # Blender states only the angle over the width: pixels are then square
-    if fx is None:
+    fx, fy = _focal(keys, "x", width), _focal(keys, "y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy  # Blender states only one: pixels are then square
+    if fx is None or fy is None:
         raise SceneError("neither fl_x (pixels) nor camera_angle_x (radians) is given; expected one of them")
     return Camera(
         width,
         height,
         fx=fx,
-        fy=fx if fy is None else fy,
+        fy=fy,
         cx=width / 2 if cx is None else cx,
         cy=height / 2 if cy is None else cy,
         world_to_camera=world_to_camera,
@@ -113,12 +126,16 @@ def _camera(
 
 
 def _focal(keys: dict[str, Any], axis: str, extent: int) -> float | None:
-    """Focal length in pixels: as given, else from the field of view (radians over ``extent`` pixels), else None."""
+    """Focal length in pixels: as given, else from the field of view (over ``extent`` pixels), else None."""
     pixels, angle = _number(keys, f"fl_{axis}"), _number(keys, f"camera_angle_{axis}")
+    if angle is None and (degrees := _number(keys, f"{axis}_fov")) is not None:
+        angle = float(np.radians(degrees))
     if pixels is not None or angle is None:
         return pixels
     if not 0 < angle < np.pi:
-        raise SceneError(f"camera_angle_{axis} is {angle}; expected radians between 0 and pi")
+        raise SceneError(
+            f"camera_angle_{axis} is {angle}; expected radians between 0 and pi (or {axis}_fov, 0 to 180 degrees)"
+        )
     return 0.5 * extent / float(np.tan(0.5 * angle))
 
 
@@ -131,19 +148,28 @@ def _number(keys: dict[str, Any], key: str) -> float | None:
     return float(value)
 
 
-def _depth(capture: Path, keys: dict[str, Any], camera: Camera, lens: Lens | None) -> DepthFile | None:
-    path = keys.get("depth_file_path")
-    if not path:
+def _depth_unit(keys: dict[str, Any], key: str) -> float | None:
+    unit = _number(keys, key)
+    if unit is None or unit > 0:
+        return unit
+    if any(keys.get(name) for name in DEPTH_KEYS):
+        raise SceneError(f"the depth unit is {unit}; expected world lengths per stored step, above 0, e.g. 0.001")
+    return None  # no depth image needs it
+
+
+def _depth_path(capture: Path, keys: dict[str, Any], lens: Lens | None) -> Path | None:
+    key = next((key for key in DEPTH_KEYS if keys.get(key)), None)
+    if key is None:
         return None
     if lens is not None and lens.wraps:
-        raise SceneError("depth_file_path of an equirectangular image is not read; expected pinhole depths: remove it")
+        raise SceneError(f"{key} of an equirectangular image is not read; expected pinhole depths: remove it")
+    path = keys[key]
     inside = posixpath.normpath(str(path).replace("\\", "/"))
     if inside.startswith(("/", "..")) or "\0" in inside:
-        raise SceneError(f"depth_file_path is {path!r:.80}, which leads out of the capture folder: copy it there")
-    unit = next((unit for key in DEPTH_UNIT_KEYS if (unit := _number(keys, key)) is not None), None)
-    if unit is not None and unit <= 0:
-        raise SceneError(f"the depth unit is {unit}; expected world lengths per stored step, above 0, e.g. 0.001")
-    return DepthFile(capture / inside, camera, unit, lens=lens)
+        raise SceneError(f"{key} is {path!r:.80}, which leads out of the capture folder: copy it there")
+    if key == "depth_path" and not (capture / inside).is_file():  # instant-ngp skips these
+        return None
+    return capture / inside
 
 
 def _camera_model(keys: dict[str, Any]) -> str:

@@ -6,8 +6,8 @@ Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_
 3D Scanner App  ``frame_00000.jpg`` with ``frame_00000.json``: ``cameraPoseARFrame``, 16 numbers row by row, and
                 ``intrinsics``, 9 numbers; ``depth_00000.png``, millimeters. Most poses have no image.
 ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_wide_intrinsics/*.pincam`` (width height
-                fx fy cx cy) and ``lowres_wide.traj``: time, rotation vector, translation, world to camera, OpenCV's
-                axes. An image gets the pose nearest in time, if within 10 ms.
+                fx fy cx cy), whose names may be off by 1 ms, and ``lowres_wide.traj``: time, rotation vector,
+                translation, world to camera, OpenCV's axes. An image gets the pose nearest in time, if within 10 ms.
 
 Image and depth image differ in size but share a lens. Worlds are in meters and kept as they are, so that clouds
 exported by the apps (y up) fit. Images are in the sensor's landscape orientation, however the phone was held.
@@ -42,6 +42,8 @@ POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 MAX_OFFSET_S = 0.01
 """Largest time between an image and its pose."""
+PINCAM_SHIFTS_S = -0.001, 0.001
+"""By which ARKitScenes' authors look for a file of intrinsics that has not its image's time."""
 
 
 def _sensor(width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Sensor:
@@ -94,6 +96,10 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
     for file in numbered_images(folder / "lowres_wide"):
         path, lens = f"lowres_wide/{file.name}", folder / "lowres_wide_intrinsics" / f"{file.stem}.pincam"
         time = re.search(r"_(\d+\.\d+)$", file.stem)
+        if time and not lens.is_file():
+            stamps = [f"{float(time[1]) + shift:.3f}" for shift in PINCAM_SHIFTS_S]
+            beside = [lens.with_name(f"{file.stem[: time.start(1)]}{stamp}.pincam") for stamp in stamps]
+            lens = next((other for other in beside if other.is_file()), lens)
         nearest = rows[np.abs(rows[:, 0] - float(time[1])).argmin()] if time else None
         if nearest is None or time is None or not lens.is_file() or abs(nearest[0] - float(time[1])) > MAX_OFFSET_S:
             yield RecordedFrame(path, lens)

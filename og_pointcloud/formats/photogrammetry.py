@@ -8,7 +8,8 @@ RealityScan  Registration, "Internal/External camera parameters": a line per ima
              f,px,py,k1,k2,k3,k4,t1,t2``. At angles of 0 a camera looks down with north at the top. Focal length
              and principal point are in millimeters of a frame whose longer side is 36.
 
-Images are given by file name only; they are searched for in the folder and its image folders.
+Images are given by file name only, by Metashape as ``group/name`` here where names repeat. They are searched for in the
+folder and its image folders.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import posixpath
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from xml.etree import ElementTree
@@ -35,6 +37,8 @@ HEAD_BYTES = 4096
 """Bytes that are enough to recognize a file."""
 MAX_SKEW_PX = 1.0
 """Largest neglected shift by the skew b2, at the upper and lower border."""
+FISHEYES = ("fisheye", "equidistant_fisheye")
+"""Metashape's names of one model; the second since it has others."""
 FULL_FRAME_MM = 36.0
 """Longer side of the 35 mm film that RealityScan's lengths refer to."""
 COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
@@ -91,6 +95,7 @@ def _metashape(text: str, _: ImageSize) -> PosedFrames:
         raise SceneError(f"the chunks {labels:.200} have no common world; expected one chunk: align or disable chunks")
     images, dropped = [], []
     for chunk in chunks:
+        _require_common_world(chunk)
         posed, without = _chunk(chunk)
         images += posed
         dropped += without
@@ -102,20 +107,41 @@ def _cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
     return [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled") not in ("false", "0")]
 
 
+def _require_common_world(chunk: ElementTree.Element) -> None:
+    """SceneError where cameras lie in several components, one of them without a transform: it is not aligned."""
+    ids = {camera.get("component_id") for camera in _cameras(chunk) if camera.find("transform") is not None} - {None}
+    placed = {each.get("id") for each in chunk.iterfind("components/component") if each.find("transform") is not None}
+    if len(ids) > 1 and ids - placed:
+        raise SceneError(
+            f"{len(ids)} components of the chunk '{chunk.get('label') or '':.60}' have cameras but no common world; "
+            "expected one component: align or merge them, or disable the cameras of the others"
+        )
+
+
+def _paths(chunk: ElementTree.Element) -> list[tuple[ElementTree.Element, str]]:
+    """The enabled cameras and their images: labels, below those of their groups where two cameras share one."""
+    cameras = _cameras(chunk)
+    labels = [camera.get("label") or "" for camera in cameras]
+    if len(set(labels)) < len(labels):
+        groups = {camera: group.get("label") or "" for group in chunk.iterfind("cameras//group") for camera in group}
+        labels = [posixpath.join(groups.get(of, ""), label) for of, label in zip(cameras, labels, strict=True)]
+    return list(zip(cameras, labels, strict=True))
+
+
 def _chunk(chunk: ElementTree.Element) -> tuple[list[PosedImage], list[str]]:
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     worlds = {component.get("id"): _world_of(component) for component in chunk.iterfind("components/component")}
     world_of_chunk, images, dropped = _world_of(chunk), [], []
-    for camera in _cameras(chunk):
-        label, transform = camera.get("label") or "", camera.find("transform")
+    for camera, path in _paths(chunk):
+        transform = camera.find("transform")
         sensor = sensors.get(camera.get("sensor_id"))
         if transform is None or sensor is None:
-            dropped.append(label)
+            dropped.append(path)
             continue
-        with naming(f"camera '{label:.60}'"):
+        with naming(f"camera '{path:.60}'"):
             # Cameras that were aligned in several groups lie in components, each with its own transform to the world.
             world = worlds.get(camera.get("component_id")) or world_of_chunk or (1.0, np.eye(3), np.zeros(3))
-            images.append(_metashape_image(label, sensor, _floats(transform, 16).reshape(4, 4), world))
+            images.append(_metashape_image(path, sensor, _floats(transform, 16).reshape(4, 4), world))
     return images, dropped
 
 
@@ -135,7 +161,7 @@ def _world_of(element: ElementTree.Element) -> World | None:
     )
 
 
-def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleArray, world: World) -> PosedImage:
+def _metashape_image(path: str, sensor: ElementTree.Element, to_chunk: DoubleArray, world: World) -> PosedImage:
     scale, rotation, translation = world
     with np.errstate(all="ignore"):  # `Camera` refuses the result
         pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
@@ -149,7 +175,7 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleAr
     width, height = (_whole(resolution.get(side)) for side in ("width", "height"))
     kind = sensor.get("type") or "frame"
     if kind == "spherical":
-        return PosedImage(label, spherical_camera(width, height, pose), SPHERICAL)
+        return PosedImage(path, spherical_camera(width, height, pose), SPHERICAL)
     if calibration is None:
         raise SceneError("its sensor has no calibration: export the cameras again")
     terms = {child.tag: _floats(child, 1)[0].item() for child in calibration if child.tag != "resolution"}
@@ -159,16 +185,16 @@ def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: DoubleAr
     if abs(skew) * height > 2 * MAX_SKEW_PX * max(focal, 1.0):
         raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimize the cameras without b2")
     camera = Camera(width, height, focal + terms.pop("b1", 0.0), focal, cx, cy, pose)
-    return PosedImage(label, camera, _metashape_lens(kind, terms))
+    return PosedImage(path, camera, _metashape_lens(kind, terms))
 
 
 def _metashape_lens(kind: str, terms: dict[str, float]) -> Lens | None:
-    if kind not in ("frame", "fisheye"):
+    if kind not in ("frame", *FISHEYES):
         raise SceneError(
             f"its sensor is of type '{kind:.40}'; expected frame, fisheye or spherical: undistort the images"
         )
     terms["p1"], terms["p2"] = terms.get("p2", 0.0), terms.get("p1", 0.0)
-    if kind == "fisheye":
+    if kind in FISHEYES:
         return lens_of("fisheye", terms)
     terms["r8"] = terms.pop("k4", 0.0)
     return lens_of("perspective", terms)

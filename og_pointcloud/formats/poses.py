@@ -36,7 +36,8 @@ class PosedImage:
     path: as written there, with forward slashes; relative to the capture folder or to its image folder.
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
     lens: None for a pinhole. depth: the depth image that the pose file or data set has for it.
-    face: the view's part of the image; None if the image is the view.
+    face: the view's part of the image; None if the image is the view. depth_unit, integer_depth_unit: as the pose file
+    states them, for a depth image that it does not name; as in `DepthFile`.
     """
 
     path: str
@@ -44,6 +45,8 @@ class PosedImage:
     lens: Lens | None = None
     depth: DepthFile | None = None
     face: Face | None = None
+    depth_unit: float | None = None
+    integer_depth_unit: float | None = None
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ Poses are camera-to-world with OpenCV axes. Pixel centers are at whole numbers; 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -152,18 +153,20 @@ def _replica(folder: Path) -> Iterator[RecordedFrame]:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
-    # Images and poses are matched by order alone: with fewer poses than images, it is unknown which images lack one.
-    if not images or len(images) > len(poses):
+    lines = list(range(len(poses)))
+    if len(images) != len(poses):  # a thinned recording: frame000010 has the pose of line 10, counted from 0
+        lines = [int((re.findall(r"\d+", file.stem) or [len(poses)])[-1]) for file in images]
+    if not images or max(lines) >= len(poses):
         raise SceneError(
             f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "
-            "image and a pose for each: copy both from one run"
+            "image and a pose for each, in line i (from 0) for frame i: copy both from one run"
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
     lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)  # meters per stored step
-    for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
+    for file, line in zip(images, lines, strict=True):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
-        source = f"{folder / 'traj.txt'}, line {line}"
-        yield RecordedFrame(f"results/{file.name}", source, pose, lens, (lens, depth_file))
+        source = f"{folder / 'traj.txt'}, line {line + 1}"
+        yield RecordedFrame(f"results/{file.name}", source, poses[line], lens, (lens, depth_file))
 
 
 def _replica_parameters(folder: Path) -> list[float]:
