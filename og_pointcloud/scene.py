@@ -175,7 +175,8 @@ class Camera:
     def center(self) -> DoubleArray:
         """Camera center in the local frame, (3,) float64."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
-        return -rotation.T @ translation
+        # Not by the transpose: of rounded rows in map coordinates, that is meters from where `project` looks from.
+        return np.linalg.solve(rotation, -translation).astype(np.float64, copy=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,14 @@ def test_projected_points_lie_on_the_ray_of_their_pixel(seed: int):
     assert not camera.shows(uv_px)[~before].any()
 
 
+def test_the_center_of_a_pose_of_rounded_numbers_is_where_it_projects_from():
+    place = np.array([500_000.0, 5_600_000.0, 100.0])  # UTM, meters
+    rotation = Rotation.random(rng=np.random.default_rng(0)).as_matrix().round(6)
+    camera = Camera(64, 48, 50.0, 60.0, 30.0, 25.0, rigid(rotation, -rotation @ place))
+    np.testing.assert_allclose(camera.center, place, atol=1e-6)
+    assert np.abs(camera.world_to_camera @ [*camera.center, 1])[:3].max() < 1e-6
+
+
 def test_the_middle_of_the_first_pixel_is_at_a_half():
     camera = Camera(4, 3, 2.0, 2.0, 0.5, 0.5, np.eye(4))
     uv_px, depth = camera.project(np.array([[0.0, 0.0, 7.0], [7.0, 0.0, 7.0], [14.0, 0, 7.0], [0, 0, 0], [0, 0, -7.0]]))
