@@ -86,7 +86,8 @@ def dense_tensor(tensor: Any) -> NDArray[Any] | None:
     """A torch tensor on any device as an array; None for a sparse tensor or anything else."""
     try:
         tensor = tensor.detach().cpu()
-        return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
+        known = not tensor.is_floating_point() or tensor.dtype.itemsize > 2  # numpy has no bfloat16
+        return (tensor if known else tensor.double()).numpy()
     except (AttributeError, TypeError, RuntimeError):
         return None
 

@@ -96,6 +96,14 @@ def test_an_empty_cloud_is_refused(scene, kind):
         og3.segment(cloud, WORDS, scene)
 
 
+def test_positions_of_open3d_are_points(scene):
+    expected = og.segment(scene.xyz, WORDS, scene).labels
+    legacy = legacy_cloud(scene)
+    tensor = open3d.t.geometry.PointCloud.from_legacy(legacy)
+    for points in (legacy.points, tensor.point.positions):
+        np.testing.assert_array_equal(og.segment(points, WORDS, scene).labels, expected)
+
+
 def test_other_geometry_is_refused(scene):
     lines = open3d.geometry.LineSet(legacy_cloud(scene).points, open3d.utility.Vector2iVector(np.array([[0, 1]])))
     with pytest.raises(OgPointcloudError, match=r"a LineSet of open3d.* cannot be painted"):

@@ -101,6 +101,19 @@ def test_far_outliers_do_not_grow_the_table():
     assert len(outlier_grid.nodes) <= 2 * len(room_grid.nodes)
 
 
+def test_a_long_map_gets_wider_cells_and_every_answer_is_certain(monkeypatch):
+    monkeypatch.setattr(lookup_grid, "MIN_BLOCK_BUDGET", 300)
+    monkeypatch.setattr(lookup_grid, "BLOCKS_PER_POINT", 0)
+    along = np.linspace(0, 60, 1500)  # a street from corner to corner of its bounds, its points 0.05 apart or more
+    xyz = np.stack([along, along, along / 2], axis=1) + np.random.default_rng(0).normal(scale=0.05, size=(1500, 3))
+    cloud = replace(make_cloud(xyz.astype(np.float32), np.arange(1500) % 3), spacing=0.05, reach=0.15)
+    points = np.concatenate([cloud.xyz, queries(cloud, 200)]).astype(np.float32)
+    found = run(cloud, points, texts(cloud))
+    assert found["certain"].all()
+    assert (found["instance"] == instances_plainly(cloud, points)).all()
+    assert (found["instance"][:1500] >= 0).all()
+
+
 @pytest.mark.parametrize("nodes", [5, 100, 260])
 def test_a_table_over_its_budget_of_nodes_leaves_boxes_open_and_stays_right(monkeypatch, nodes):
     cloud = CLOUDS["room"]

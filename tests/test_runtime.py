@@ -456,6 +456,44 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
         result.save(tmp_path / "out.ply", splats=Points.from_world(scene.xyz))
 
 
+def test_an_empty_frame_does_not_hide_that_the_next_ones_are_misplaced(scene):
+    ask = og.Segmenter(scene, ["apple"])
+    for points, told in ((np.zeros((0, 3)), "the cloud has 0 points"), (scene.xyz + 100, "too far from the scene")):
+        with pytest.warns(UserWarning, match=told):
+            ask(points)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            ask(points)
+
+
+def test_a_scene_is_used_from_another_folder(bundle, tmp_path, monkeypatch):
+    monkeypatch.chdir(bundle.parent)
+    assert og.load(bundle.name).path == bundle
+    with pytest.raises(BundleError, match=r"^nothing\.ogpc is not a file"):
+        og.load("nothing.ogpc")
+
+
+def test_what_a_strangers_words_do_to_a_terminal_is_shown(scene):
+    words = {"\x1b[2Jevil\n* instance 9": np.eye(WIDTH)[0], "pear": np.eye(WIDTH)[1]}
+    for shown in (repr(og.segment(scene, words)), repr(og.select(scene, "apple", against=words))):
+        assert "\x1b" not in shown
+        assert not any(line.startswith("* instance 9") for line in shown.splitlines())
+
+
+def test_a_vector_of_another_width_is_blamed_on_the_vector(scene):
+    with pytest.raises(FeatureSpaceError, match=r"vector of 'mug' .*\(dimension 4\)"):
+        og.select(scene, {"mug": np.ones(4)})
+
+
+def test_a_pose_that_torch_rounded_is_told_as_one_that_numpy_did(scene):
+    torch = pytest.importorskip("torch")
+    pose = np.eye(4)
+    pose[:3, 3] = 5e6 + 0.3
+    for rounded in (pose.astype(np.float32), torch.tensor(pose, dtype=torch.float32)):
+        with pytest.warns(UserWarning, match="float32 rounded the pose to steps of 0.5"):
+            og.segment(scene.xyz - pose[:3, 3], ["apple"], scene, pose=rounded)
+
+
 def test_what_is_printed_fits_on_a_screen(scene):
     points = np.concatenate([scene.xyz, [[99, 99, 99]]])
     result = quietly(points, ["apple", "pear"], scene)
@@ -525,18 +563,13 @@ def test_no_label_of_a_clouds_own_points_is_explained():
         og.segment(CLOUDS["instances without any descriptor"], ["apple"])
 
 
-def test_segmenter_answers_like_segment_and_warns_once(scene):
+def test_segmenter_answers_like_segment(scene):
     ask = og.Segmenter(scene, ["apple", "pear"])
     assert ask.names == ("apple", "pear")
     points = queries(scene.cloud, 200).astype(np.float64)
     ours, theirs = ask(points), og.segment(points, ["apple", "pear"], scene)
     for key in ("labels", "scores", "instances"):
         assert (getattr(ours, key) == getattr(theirs, key)).all()
-    with pytest.warns(UserWarning, match="0 points"):
-        assert len(ask(np.zeros((0, 3)))) == 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ask(np.full((4, 3), 50.0))
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,9 @@ their center: ``bundle.nearest`` answers queries there. Cells are 1.5 point spac
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,22 +126,29 @@ class _Frame:
 
 
 def _grid_frame(cloud: LabelledCloud) -> _Frame:
-    """A grid around all points; for a scene with far outliers, around most of it only."""
-    cell_size = float(np.float32(max(CELL_PER_SPACING * cloud.spacing, cloud.reach / CELLS_PER_REACH)))
+    """A grid around all points; of wider cells for a long map, around most of it only for one with far outliers."""
+    cell_size = max(CELL_PER_SPACING * cloud.spacing, cloud.reach / CELLS_PER_REACH)
     if len(cloud) == 0:
-        return _Frame(np.zeros(3), cell_size, (3, 3, 3), True)
+        return _Frame(np.zeros(3), float(np.float32(cell_size)), (3, 3, 3), True)
     allowed = min(max(BLOCKS_PER_POINT * len(cloud), MIN_BLOCK_BUDGET), MAX_BLOCK_BUDGET)
+    # The narrowest cells, then the smallest share of outliers, on each side of each axis, that make the grid small
+    # enough. What is left out has no certain answer: a hundredth may be outliers, more is part of the map.
+    tries = [(width, left_out) for width in (1, 2, 4, 8) for left_out in (0.0, 1e-4, 1e-3, 1e-2)]
+    for width, left_out in [*tries, (8, 0.05), (8, 0.2), (8, 0.4)]:
+        frame = _frame(cloud, width * cell_size, left_out)
+        if math.prod(frame.blocks) <= allowed and max(frame.shape) <= MAX_BRICKS_PER_AXIS:
+            return frame
+    return replace(_frame(cloud, 8 * cell_size, 0.4), shape=(3, 3, 3))
+
+
+def _frame(cloud: LabelledCloud, cell_size: float, left_out: float) -> _Frame:
+    """A grid around the points without this share of them on each side of each axis."""
+    cell_size = float(np.float32(cell_size))
     border = cloud.reach + cell_size  # the extra cell absorbs all rounding
-    # The smallest share of outliers, on each side of each axis, whose removal makes the grid small enough.
-    for left_out in (0.0, 1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.4):
-        ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
-        shape = np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * EDGE)) + 2
-        if np.ceil(shape / EDGE).prod() <= allowed and shape.max() <= MAX_BRICKS_PER_AXIS:
-            break
-    else:
-        shape = np.full(3, 3.0)
+    ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
+    x, y, z = (np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * EDGE)) + 2).tolist()
     low = (ends[0] - border - cell_size * EDGE).astype(np.float32)
-    return _Frame(low.astype(np.float64), cell_size, (int(shape[0]), int(shape[1]), int(shape[2])), left_out == 0)
+    return _Frame(low.astype(np.float64), cell_size, (int(x), int(y), int(z)), left_out == 0)
 
 
 def _points_by_brick(cloud: LabelledCloud, frame: _Frame) -> tuple[tuple, NDArray[np.int64]]:

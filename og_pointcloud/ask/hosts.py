@@ -108,6 +108,10 @@ def _host(pcd: Any) -> str | None:
 
 
 def _of_open3d(cloud: Any) -> Any:
+    if type(cloud).__name__ == "Vector3dVector":  # cloud.points
+        return cloud
+    if type(cloud).__name__ == "Tensor":  # cloud.point.positions
+        return cloud.cpu().numpy()
     for name in ("points", "vertices"):  # legacy
         if hasattr(cloud, name):
             return getattr(cloud, name)

@@ -303,7 +303,7 @@ class Segmenter:
         words = scene.words(labels, text_features)
         self.names = words.names
         """The labels, in the order of their numbers."""
-        self._max_distance, self._warned = max_distance, False
+        self._max_distance, self._warned = max_distance, set[bool]()
         self._choice = scene.chooser.choose(words.vectors)
 
     def __call__(self, points: Any, pose: ArrayLike | None = None) -> Segmentation:
@@ -311,7 +311,8 @@ class Segmenter:
 
         pose: (4, 4), maps the points to the scene's world, as a sensor's pose in the map does; ``xyz`` of the result
         is then in world coordinates.
-        Warns the first time that no point gets a label, not at every empty frame of a stream.
+        Warns the first time that no point gets a label, and the first time that there is none, not at every such frame
+        of a stream.
         """
         return self._answer(points, pose)
 
@@ -336,8 +337,9 @@ class Segmenter:
             points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
             certainty_of,
         )  # fmt: skip
-        if not self._warned and (reason := _label_warning(result, scene, are_own, pose)):
-            self._warned = True
+        is_empty = len(result) == 0
+        if is_empty not in self._warned and (reason := _label_warning(result, scene, are_own, pose)):
+            self._warned.add(is_empty)
             warnings.warn(reason, stacklevel=3)  # at the call of segment, or of the segmenter
         return result
 

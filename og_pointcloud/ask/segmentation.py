@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.hosts import import_plugin
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, printable
 from og_pointcloud.formats.atomic import StrPath, replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points
@@ -71,7 +71,7 @@ class Segmentation:
     def __repr__(self) -> str:
         """Points per label, the most frequent first, and per reason for having none; and whether labels had to fit."""
         frequent = sorted(((name, count) for name, count in self.counts().items() if count), key=lambda row: -row[1])
-        rows = [(name, f"{count:,}") for name, count in frequent[:MAX_LABELS_SHOWN]]
+        rows = [(printable(name, 40), f"{count:,}") for name, count in frequent[:MAX_LABELS_SHOWN]]
         if rest := frequent[MAX_LABELS_SHOWN:]:
             rows.append((f"{len(rest)} more labels", f"{sum(count for _, count in rest):,}"))
         rows += [(f"unknown, {reason}", f"{count:,}") for reason, count in self.unknown_because().items()]

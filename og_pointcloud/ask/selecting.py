@@ -19,7 +19,7 @@ from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import MAX_ROWS_SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, counted
+from og_pointcloud.errors import OgPointcloudError, counted, printable
 from og_pointcloud.text.words import Labels, TextFeatures
 
 
@@ -113,10 +113,10 @@ class Selection(Sequence[Match]):
         return json.dumps(record, indent=2, ensure_ascii=False)
 
     def __repr__(self) -> str:
-        lines = [f"'{self.query}' fits {len(self.fitting)} of {counted(len(self), 'instance')}"]
+        lines = [f"'{printable(self.query, 60)}' fits {len(self.fitting)} of {counted(len(self), 'instance')}"]
         for match in self[:MAX_ROWS_SHOWN]:
             mark = "*" if match.fits else " "
-            rival = f"{match.rival} {match.rival_score:.3f}" if match.rival else "-"
+            rival = f"{printable(match.rival, 40)} {match.rival_score:.3f}" if match.rival else "-"
             lines.append(
                 f"{mark} instance {match.instance:<5} {match.score:.3f}  {match.points:>9,} points  rival {rival}"
             )
@@ -145,6 +145,8 @@ def select(
         shown = list(text) if isinstance(text, Mapping) else text
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
     query = scene.words(text, text_features)
+    asked = FeatureSpace(scene.feature_space, query.vectors.shape[1])
+    scene.cloud.space.require(asked, f"vector of '{query.names[0]}'")
     rivals = _rivals(scene, query, against, text_features)
     choice = scene.chooser.choose(np.concatenate([query.vectors, rivals.vectors]))  # label 0 is the query
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))

@@ -61,7 +61,8 @@ def read_bundle(path: StrPath) -> Bundle:
         manifest = _manifest(members)
         _check_members(manifest, members, carried)
         # Only complete, declared members are parsed, and each is checked against the others.
-        return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
+        # Absolute: what else the file holds is read later, perhaps from another working folder.
+        return Bundle(path.absolute(), _cloud(manifest, members), members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
 

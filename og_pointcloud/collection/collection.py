@@ -99,7 +99,7 @@ class Collection:
     def __init__(self, path: StrPath, *, lance: str | None = None) -> None:
         """path: of an atlas; OgPointcloudError for any other or damaged file. lance: folder or URI of the database that
         `lance.write_lance` made of it, which is then searched instead of memory (extra 'lance')."""
-        self.path = Path(path)
+        self.path = Path(path).absolute()
         self._lance = None if lance is None else LanceTables(lance)
         self.changes: Changes | None = None
         self._stamp: tuple[int, ...] = ()
