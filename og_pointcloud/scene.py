@@ -177,7 +177,8 @@ class Camera:
         """Camera center in the local frame, (3,) float64."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         # Not by the transpose: of rounded rows in map coordinates, that is meters from where `project` looks from.
-        return np.linalg.solve(rotation, -translation) + 0.0  # no -0.astype(np.float64, copy=False)
+        center = np.linalg.solve(rotation, -translation) + 0.0  # no -0
+        return center.astype(np.float64, copy=False)
 
 
 @dataclass(frozen=True, eq=False)
