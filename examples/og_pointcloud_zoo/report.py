@@ -24,6 +24,7 @@ UNITS = {
     "poses": "poses off by, pixels",
     "masks": "masks missing, share",
     "eroded": "masks end early by, pixels",
+    "exposure": "exposure off by, share",
 }
 SHOWN = 5
 
@@ -99,7 +100,10 @@ def write_needs(rows: Sequence[Row], path: Path) -> Path:
     """Mean mIoU, ours and of the best baselines, against how much worse the scenes were made: one plot per way."""
     kinds = list(dict.fromkeys(row.worse.partition("=")[0] for row in rows if row.worse))
     figure = require_matplotlib()(figsize=(11, 6), layout="constrained")
-    of_kind = figure.subplots(2, -(-len(kinds) // 2), sharey=True, squeeze=False).ravel()
+    columns = -(-len(kinds) // 2)
+    of_kind = figure.subplots(2, columns, sharey=True, squeeze=False).ravel()
+    for unused in of_kind[len(kinds) :]:
+        unused.set_axis_off()
     for axes, kind in zip(of_kind, kinds, strict=False):
         steps = ["", *dict.fromkeys(row.worse for row in rows if row.worse.startswith(f"{kind}="))]
         for label, name in (("ours", "miou"), ("best baseline", "baseline_miou")):
@@ -107,7 +111,7 @@ def write_needs(rows: Sequence[Row], path: Path) -> Path:
             if None not in means[0]:
                 axes.plot(range(len(steps)), [np.mean(values) for values in means], marker="o", label=label)
         axes.set_xticks(range(len(steps)), ["as it is", *(step.partition("=")[2] for step in steps[1:])])
-        axes.set(title=UNITS.get(kind, kind), ylim=(0, 1), ylabel="mean mIoU" if axes in of_kind[::3] else "")
+        axes.set(title=UNITS.get(kind, kind), ylim=(0, 1), ylabel="mean mIoU" if axes in of_kind[::columns] else "")
         axes.grid(alpha=0.3)
     of_kind[0].legend(fontsize=9, frameon=False)
     with replacing(path) as file:
