@@ -137,7 +137,8 @@ def _fingerprint(settings: MaskSettings) -> str:
     of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
     given = sorted(settings.folder.rglob("*")) if settings.folder else user_source(place) if kind == "python" else []
-    models = [encoder_folder(settings.encoder) if settings.encoder else None, model_folder(place) if place else None]
+    encoder, model = settings.encoder, place if kind == "sam" else None
+    models = encoder_folder(encoder) if encoder else None, model_folder(model) if model else None
     given = [*given, *(file for folder in models if folder for file in sorted(folder.rglob("*")))]
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
