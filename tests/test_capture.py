@@ -261,15 +261,19 @@ def test_equal_stems_in_two_folders_are_told_apart_by_folder(tmp_path):
     assert len(world.names) == 3
 
 
-def test_dots_in_names_are_no_suffix(capture):
+@pytest.mark.parametrize("name", ["scan.0001", "frame_01.npy"])
+def test_dots_in_names_are_no_suffix(capture, name):
+    """Not even numpy's own, beside a view of the name without it."""
     folder, _ = capture
-    edit_poses(folder, lambda content: content["frames"][0].update(file_path="./images/scan.0001"))
+    edit_poses(folder, lambda content: content["frames"][0].update(file_path=f"./images/{name}"))
     for kind in ("images", "masks"):
-        (folder / kind / "frame_00.png").rename(folder / kind / "scan.0001.png")
-    write_masks(folder, ["scan.0001", "frame_01", "frame_02"])
-    view = read_capture(folder).views[0]
-    assert view.name == "scan.0001"
-    assert view.image_rgb() is not None
+        (folder / kind / "frame_00.png").rename(folder / kind / f"{name}.png")
+    _, features = write_masks(folder, [name, "frame_01", "frame_02"])
+    views = read_capture(folder).views
+    assert views[0].name == name
+    assert views[0].image_rgb() is not None
+    for view in views[:2]:
+        np.testing.assert_array_equal(view.mask_features, features[view.name].astype(np.float32))
 
 
 def test_images_are_optional_but_missed(capture):
@@ -280,7 +284,10 @@ def test_images_are_optional_but_missed(capture):
     assert [view.image_rgb() is None for view in scene.views] == [False, True, False]
 
 
-@pytest.mark.parametrize("path", ["/somewhere/else/frame_00.png", "../other/frame_00.png", "../../frame_00"])
+@pytest.mark.parametrize(
+    "path",
+    ["/somewhere/else/frame_00.png", "../other/frame_00.png", "../../frame_00", "C:\\scans\\room 1\\frame_00.png"],
+)
 def test_paths_out_of_the_folder_are_looked_for_inside(capture, path):
     folder, _ = capture
     outside = folder.parent / "other"
@@ -439,7 +446,10 @@ NO_GRAY = "; expected an 8-bit or 16-bit gray PNG"
     ("change", "says"),
     [
         (without("transforms.json"), r"has no pose file; expected transforms.json .* sparse/0"),
-        (posed(lambda content: content["frames"].append(content["frames"][0])), "two views are named 'frame_00'"),
+        (
+            posed(lambda content: content["frames"].append(content["frames"][0])),
+            "two images have the path 'images/frame_00'; exp",
+        ),
         (no_images, r"image 'images/frame_00.png' is not found, and the pose file has no w and h"),
         (no_cloud, r"no geometry; expected points.ply .*points3D.*--gaussians"),
         (two_pcds, r"has 2 .pcd files \(a.pcd, b.pcd, ...\); expected one: name the one"),

@@ -120,6 +120,8 @@ def test_distortion_is_never_ignored(tmp_path, model):
         ({"camera_model": "VR180_L"}, "the camera model is VR180_L; expected one of OPENCV"),
         ({"camera_model": "FISHEYE624"}, "the camera model is FISHEYE624"),
         ({"ftheta_p0": 1.0}, "the camera model is ftheta_p0"),
+        ({"equirectangular": True}, "the camera model is equirectangular"),
+        ({"orthographic": True}, "the camera model is orthographic"),
         ({"k4": 0.01}, "k4, k5, k6 are 0.01, 0.0, 0.0; expected 0"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 are 0.01, 0.0; expected 0 for a fisheye"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x .* nor camera_angle_x"),

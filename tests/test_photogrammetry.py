@@ -179,6 +179,9 @@ def test_repeated_labels_are_told_apart_by_their_groups(tmp_path):
     text = text.replace("CAMERA", "camera")
     assert [image.path for image in read(tmp_path, text).images] == ["left/a", "right/a", "b"]
     assert read_poses(tmp_path).names == ("left/a", "right/a", "b")
+    (tmp_path / "cameras.xml").write_text(text.replace('"right"', '"left"'))
+    with pytest.raises(SceneError, match=r"cameras.xml: two images have the path 'left/a'; expected unique ones"):
+        read_poses(tmp_path)
 
 
 @pytest.mark.parametrize(

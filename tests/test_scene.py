@@ -176,6 +176,8 @@ def test_views_may_come_from_a_generator():
     views = [_view(name="a"), _view(name="b")]
     scene = Scene(Points(np.zeros((1, 3), np.float32), np.zeros(3)), (view for view in views), "letters")  # type: ignore[arg-type]
     assert scene.views == tuple(views)
+    with pytest.raises(SceneError, match="two views are named 'a'; expected unique"):
+        Scene(scene.points, views[:1] * 2, "letters")  # type: ignore[arg-type]
     with pytest.raises(SceneError, match="the scene has 0 views"):
         Scene(scene.points, iter(()), "letters")  # type: ignore[arg-type]
 

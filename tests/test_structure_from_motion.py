@@ -80,7 +80,7 @@ def test_poses_and_points_of_a_room(photographs, tmp_path, capsys):
     assert len(points) > 300
     xyz = scale * points.xyz_world @ rotation.T + shift
     assert np.median(distance_to_surface(xyz)) < 0.02, "of a room 4 long"
-    with pytest.raises(SceneError, match="sparse is there already"):
+    with pytest.raises(SceneError, match="sparse already exists"):
         find_poses(tmp_path / "photographs", tmp_path / "room")
 
 

@@ -57,6 +57,7 @@ from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes, the_only
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera, CutMasks, Points, Scene, View
 
 if TYPE_CHECKING:
@@ -176,7 +177,9 @@ def _stated_poses(capture: Path) -> CapturePoses:
             f"'{printable(frames.dropped[0], 80)}'",
             stacklevel=4,
         )
-    return CapturePoses(_view_names(frames.images), frames.images, source, frames.ply_file_path, is_recording)
+    with naming(source):
+        names = _view_names(frames.images)
+    return CapturePoses(names, frames.images, source, frames.ply_file_path, is_recording)
 
 
 def _recording(capture: Path) -> PosedFrames:
@@ -208,9 +211,11 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
     """File stems; where two images share one (as in rigs), paths from the folder that all images share."""
     paths = [posixpath.normpath(without_suffix(image.path)) for image in images]
     stems = [posixpath.basename(path) for path in paths]
-    # Two images with the same path cannot be told apart by any name: the scene refuses such stems.
-    if len(set(stems)) == len(stems) or len(set(paths)) < len(paths):
+    if len(set(stems)) == len(stems):
         return tuple(stems)
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise SceneError(f"two images have the path '{twice}'; expected unique ones: rename or leave out one of them")
     paths = [path.lstrip("/") for path in paths]
     shared = posixpath.commonpath([posixpath.dirname(path) for path in paths])
     names = [path[len(shared) :].lstrip("/") for path in paths]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import posixpath
+import re
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import BinaryIO, NamedTuple
@@ -58,7 +59,7 @@ def find_image(capture: Path, path: str) -> Path | None:
     The path is tried inside the capture folder, then inside its image folders; each also with an image suffix added. A
     path that leads out of the capture folder is never opened: the longest of its endings that is found is used.
     """
-    inside = posixpath.normpath(path)
+    inside = posixpath.normpath(re.sub(r"^[A-Za-z]:/", "/", path))  # without a Windows drive
     led_out = inside.startswith(("/", ".."))  # absolute paths of the machine that wrote the file, or worse
     parts = [part for part in inside.split("/") if part not in ("", ".", "..")]
     for first in range(len(parts) if led_out else min(1, len(parts))):

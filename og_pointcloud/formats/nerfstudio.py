@@ -36,6 +36,8 @@ TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
 SPHERICAL_MODELS = ("EQUIRECTANGULAR",)
+OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")
+"""Keys of instant-ngp, whose presence alone means one of its lenses that are not read."""
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 FOCAL_KEYS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -179,7 +181,7 @@ def _camera_model(keys: dict[str, Any]) -> str:
 def _lens(keys: dict[str, Any]) -> Lens | None:
     """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all given terms count."""
     model = _camera_model(keys)
-    other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # other lenses of instant-ngp
+    other = next((key for key in keys if key.startswith(OTHER_LENSES)), None)
     known = PERSPECTIVE_MODELS + FISHEYE_MODELS + SPHERICAL_MODELS
     if model not in known or other:
         raise SceneError(

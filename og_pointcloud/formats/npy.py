@@ -79,13 +79,14 @@ def read_npz(
     """
     try:
         with zipfile.ZipFile(file) as archive:
-            # numpy.savez appends .npy to every name, even to one that ends in it.
-            held = {info.filename.removesuffix(".npy").removesuffix(".npy"): info for info in archive.infolist()}
+            held = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             if (total := sum(info.file_size for info in held.values())) > max_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {max_bytes}")
             if total > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * file.stat().st_size):
                 raise ValueError(f"it unpacks to {total} bytes, {MAX_RATIO} times its size: it is made to fill memory")
-            arrays = {name: _array_from_zip(archive, held[name]) for name in (*needed, *optional) if name in held}
+            # OpenGaussian's names end in .npy, and numpy.savez appends another one.
+            found = {name: held.get(name) or held.get(f"{name}.npy") for name in (*needed, *optional)}
+            arrays = {name: _array_from_zip(archive, info) for name, info in found.items() if info}
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
         raise kind(
             f"{file}: it cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
