@@ -28,7 +28,7 @@ from og_pointcloud.fitting.membership import (
     instance_area,
 )
 from og_pointcloud.fitting.see_through import _front_run, without_see_through
-from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes, votes_of_points
+from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
@@ -325,7 +325,7 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     votes = view_votes(table)
     has_mask = random.uniform(size=(5, 6)) < 0.5
     allowed = np.array([True, True, False, True, True])
-    columns = votes_of_points(votes)[0]()
+    columns = votes.by_point
     actual = _best_group(*columns, group, has_mask, allowed, 0.45, 0.1)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     per_group = np.array([in_mask[group == k].sum(axis=0) if allowed[k] else 0 * in_mask[0] for k in range(5)])
@@ -349,7 +349,7 @@ def test_the_share_of_open_views_is_that_of_the_literal_reference(seed: int) -> 
     table, numbers = random_case(random)
     group, best = np.array(numbers, np.int32), random.integers(-1, 5, 200).astype(np.int32)
     votes, has_mask = view_votes(table), random.uniform(size=(5, 6)) < 0.5
-    columns = votes_of_points(votes)[0]()
+    columns = votes.by_point
     share = _reweighted_share(*columns, group, table.mask_view, has_mask, best)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     of_view = votes_of_views(in_mask, group, table.mask_view)

@@ -14,7 +14,6 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 from test_membership import decide, groups, on_a_line, torn_case
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.fitting import view_votes as votes_module
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import Membership, assign_and_mark_spanning, assign_points
@@ -147,13 +146,3 @@ def test_a_thing_too_small_for_the_sample_that_reports_were_counted_on_is_found(
     assert (sample.scene.reports.report_column[:, 1] == -1).all()
     found = told(table, [0, 1] * 4, whole=sample).instance_ids
     assert found.tolist() == [0] * 30 + [BACKGROUND] * 20 + [1] * 5 + [BACKGROUND] * 5
-
-
-def test_points_by_parts_of_memory_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    table, numbers = torn_case(np.random.default_rng(3))
-    at_once = decide(table, numbers)
-    monkeypatch.setattr(votes_module, "ENTRIES_AT_ONCE", 100)
-    in_parts = decide(table, numbers)
-    np.testing.assert_array_equal(in_parts.instance_ids, at_once.instance_ids)
-    np.testing.assert_array_equal(in_parts.certainty, at_once.certainty)
-    assert len(set(at_once.instance_ids)) >= 5

@@ -48,7 +48,7 @@ from og_pointcloud.fitting.colors import MAX_COLOR_RATIO, color_ratios, outline_
 from og_pointcloud.fitting.grouping import MaskGroups, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_reports import ViewReports, likely_states
-from og_pointcloud.fitting.view_votes import ViewVotes, VotesOfPoints, votes_of_points
+from og_pointcloud.fitting.view_votes import PointVotes, ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 from og_pointcloud.settings import FitSettings, MembershipSettings
@@ -114,8 +114,7 @@ def assign_points(
     """
     has_mask = views_with_masks(table, groups)
     # First among all groups, which shows the groups that are noise, then among the others.
-    point_votes = votes_of_points(votes)
-    inputs = point_votes, groups.voting_group, table.mask_view, has_mask
+    inputs = votes.by_point, groups.voting_group, table.mask_view, has_mask
     support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
     rate, dismissed, p_missed = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     typical = scene.typical_openness if scene else votes.typical_openness
@@ -133,7 +132,7 @@ def assign_points(
     mask_reports, size = (report, table.mask_view), (votes.vote.shape[0], groups.count)
     known = scene.reports if scene else None
     likely, reports, weights = likely_states(
-        point_votes, mask_reports, size, clear, support.group, visibility, around, rgb, known
+        votes.by_point, mask_reports, size, clear, support.group, visibility, around, rgb, known
     )
     possible = (support.share > settings.possible_share) & (support.reweighted_share > settings.possible_openly)
     ids = _refined(likely.ids, support, possible, (table, groups.voting_group), around, weights, settings)
@@ -150,7 +149,7 @@ def assign_by_votes_alone(
     """(n,) the states of points that views agree on and of possible ones that adjoin them, as if all were seen equally
     openly. For a few of many views: too few to count what each of them reports, or to doubt what one alone shows."""
     has_mask, settings = views_with_masks(table, groups), replace(settings, swallowed_votes=0.0)
-    inputs = votes_of_points(votes), groups.voting_group, table.mask_view, has_mask
+    inputs = votes.by_point, groups.voting_group, table.mask_view, has_mask
     support = _support(*inputs, np.ones(groups.count, np.bool_), settings)
     _, dismissed, _ = _contradicted(support, votes, has_mask.sum(axis=1), settings)
     support = _support(*inputs, ~dismissed, settings)
@@ -228,7 +227,7 @@ def _refined(
 
 
 def _support(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     group: NDArray[np.int32],
     mask_view: NDArray[np.int32],
     has_mask: NDArray[np.bool_],
@@ -241,12 +240,11 @@ def _support(
     view of each. has_mask: (groups, views), whether a view has a mask of a group. allowed: (groups,) those to choose
     from.
     """
-    found = []
-    for chunk in point_votes:
-        votes = chunk()
-        best, *best_votes = _best_group(*votes, group, has_mask, allowed, settings.sure_share, settings.swallowed_votes)
-        found.append((best, *best_votes, _reweighted_share(*votes, group, mask_view, has_mask, best)))
-    return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    best, votes, possible, total = _best_group(
+        *point_votes, group, has_mask, allowed, settings.sure_share, settings.swallowed_votes
+    )
+    reweighted_share = _reweighted_share(*point_votes, group, mask_view, has_mask, best)
+    return _Support(best, votes, possible, total, reweighted_share)
 
 
 @njit(cache=True, parallel=True)

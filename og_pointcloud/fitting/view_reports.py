@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
-from og_pointcloud.fitting.view_votes import VotesOfPoints
+from og_pointcloud.fitting.view_votes import PointVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 
@@ -114,7 +114,7 @@ class LikelyStates:
 
 
 def likely_states(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     size: tuple[int, int],
     clear: NDArray[np.int32],
@@ -151,28 +151,27 @@ def likely_states(
 
 
 def _spanned_groups(
-    point_votes: VotesOfPoints, group: NDArray[np.int32], groups: int, clear: NDArray[np.int32]
+    point_votes: PointVotes, group: NDArray[np.int32], groups: int, clear: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
     """`ViewReports.spanned`."""
-    spanned, low = np.zeros((max(int(group.max(initial=-1)) + 1 - groups, 0), groups), np.bool_), 0
-    for chunk in point_votes if len(spanned) else ():
-        low = _mark_spanned(*chunk()[0], low, group, clear, spanned)
+    spanned = np.zeros((max(int(group.max(initial=-1)) + 1 - groups, 0), groups), np.bool_)
+    if len(spanned):
+        _mark_spanned(*point_votes[0], group, clear, spanned)
     return spanned
 
 
 @njit(cache=True)
-def _mark_spanned(mask_start, of_mask, low, group, clear, spanned):  # noqa: ANN001, ANN202
-    """Marks the groups that masks span, by the points from ``low`` on. Returns the point after the last."""
+def _mark_spanned(mask_start, of_mask, group, clear, spanned):  # noqa: ANN001, ANN202
+    """Marks the groups that masks span."""
     groups = spanned.shape[1]
-    for i in range(len(mask_start) - 1):
-        for e in range(mask_start[i], mask_start[i + 1]):
-            if group[of_mask[e].row] >= groups and clear[low + i] >= 0:
-                spanned[group[of_mask[e].row] - groups, clear[low + i]] = True
-    return low + len(mask_start) - 1
+    for g in range(len(clear)):
+        for e in range(mask_start[g], mask_start[g + 1]):
+            if group[of_mask[e].row] >= groups and clear[g] >= 0:
+                spanned[group[of_mask[e].row] - groups, clear[g]] = True
 
 
 def _candidates(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     group: NDArray[np.int32],
     spanned: NDArray[np.bool_],
     clear: NDArray[np.int32],
@@ -180,38 +179,35 @@ def _candidates(
     around: Neighborhood,
 ) -> LikelyStates:
     """The candidates of all points, with probability 1 for the state of a clear point, else 0. group: (masks,)."""
-    (spanning, groups), low, found = spanned.shape, 0, []
+    spanning, groups = spanned.shape
     background = groups + spanning
     clear = np.where(clear == BACKGROUND, background, clear)  # as candidates are numbered
     span = np.concatenate([[0], np.cumsum(spanned.sum(axis=1))]), np.nonzero(spanned)[1].astype(np.int32)
     adjacency = best_group, around.index, around.adjoining
-    for chunk in point_votes:
-        masks, views = chunk()
-        found.append(_candidates_of_points(masks, views[0], low, group, groups, span, adjacency))
-        low += len(masks[0]) - 1
-    counts, state = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    probability = (state == np.repeat(clear, counts)).astype(np.float64)
-    return LikelyStates(np.concatenate([[0], np.cumsum(counts)]), state, probability, groups, background)
+    masks, (view_start, _) = point_votes
+    start, state = _candidates_of_points(masks, view_start, group, groups, span, adjacency)
+    probability = (state == np.repeat(clear, np.diff(start))).astype(np.float64)
+    return LikelyStates(start, state, probability, groups, background)
 
 
 @njit(cache=True)
-def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency):  # noqa: ANN001, ANN202
-    """Of the points from ``low`` on: (n,) their numbers of candidates, and (all,) the candidates. span: (start, groups)
-    of spanning masks. adjacency: (best group, neighbors, adjoining) of all points."""
+def _candidates_of_points(masks, view_start, group, groups, span, adjacency):  # noqa: ANN001, ANN202
+    """(n + 1,) where the candidates of each point start, and (all,) the candidates. span: (start, groups) of spanning
+    masks. adjacency: (best group, neighbors, adjoining)."""
     (mask_start, of_mask), (span_start, span_group), (best_group, neighbors, adjoining) = masks, span, adjacency
     n, capacity = len(mask_start) - 1, 0
     for e in range(len(of_mask)):
         k = group[of_mask[e].row] - groups
         capacity += 1 if k < 0 else span_start[k + 1] - span_start[k]
-    count = np.zeros(n, np.int64)
+    start = np.zeros(n + 1, np.int64)
     # Background, and at most one for each mask (or each group that it spans) and each neighbor.
     found = np.empty(n * (neighbors.shape[1] + 1) + capacity, np.int32)
     end = 0
-    for i in range(n):
-        if view_start[i] == view_start[i + 1]:
+    for g in range(n):
+        begin = start[g] = end
+        if view_start[g] == view_start[g + 1]:
             continue
-        begin, g = end, low + i
-        for e in range(mask_start[i], mask_start[i + 1]):
+        for e in range(mask_start[g], mask_start[g + 1]):
             k = group[of_mask[e].row]
             if 0 <= k < groups and not _contains(found, begin, end, k):
                 found[end] = k
@@ -227,8 +223,8 @@ def _candidates_of_points(masks, view_start, low, group, groups, span, adjacency
                 end += 1
         found[end] = groups + len(span_start) - 1
         end += 1
-        count[i] = end - begin
-    return count, found[:end].copy()
+    start[n] = end
+    return start, found[:end].copy()
 
 
 @njit(cache=True)
@@ -243,7 +239,7 @@ def _contains(found, begin, end, k):  # noqa: ANN001, ANN202
 
 
 def _empty_tables(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     views: int,
     spanned: NDArray[np.bool_],
@@ -252,9 +248,8 @@ def _empty_tables(
     """The tables of all views, filled with zeros."""
     shown = _possible_reports(mask_reports, (views, candidates.background + 1))
     report_column = np.where(shown, np.cumsum(shown, axis=1) - 1, -1).astype(np.int32)
-    seen, low = np.zeros(shown.shape, np.bool_), 0
-    for chunk in point_votes:
-        low = _mark_seen(*chunk()[1], low, candidates.start, candidates.state, seen)
+    seen = np.zeros(shown.shape, np.bool_)
+    _mark_seen(*point_votes[1], candidates.start, candidates.state, seen)
     state_row = np.where(seen, np.cumsum(seen, axis=1) - 1, -1).astype(np.int32)
     table_start = np.concatenate([[0], np.cumsum(seen.sum(axis=1) * shown.sum(axis=1))]).astype(np.int64)
     return ViewReports(report_column, state_row, table_start, np.zeros(table_start[-1], np.float32), spanned)
@@ -272,17 +267,16 @@ def _possible_reports(
 
 
 @njit(cache=True)
-def _mark_seen(view_start, of_view, low, start, state, seen):  # noqa: ANN001, ANN202
-    """Marks in (views, states) the candidates of the points that each view sees. Returns the point after the last."""
-    for i in range(len(view_start) - 1):
-        for e in range(view_start[i], view_start[i + 1]):
-            for c in range(start[low + i], start[low + i + 1]):
+def _mark_seen(view_start, of_view, start, state, seen):  # noqa: ANN001, ANN202
+    """Marks in (views, states) the candidates of the points that each view sees."""
+    for g in range(len(view_start) - 1):
+        for e in range(view_start[g], view_start[g + 1]):
+            for c in range(start[g], start[g + 1]):
                 seen[of_view[e].row, state[c]] = True
-    return low + len(view_start) - 1
 
 
 def _estimated_reports(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     candidates: LikelyStates,
     visibility: NDArray[np.float32],
@@ -291,9 +285,8 @@ def _estimated_reports(
     """What each view reports of each state, counted on points by their state probabilities (M step)."""
     report_column, state_row, table_start = table = tables.report_column, tables.state_row, tables.table_start
     states = candidates.start, candidates.state, candidates.probability
-    counts, low = np.zeros(table_start[-1]), 0
-    for chunk in point_votes:
-        low = _add_counts(*chunk(), low, mask_reports, states, visibility, table, counts)
+    counts = np.zeros(table_start[-1])
+    _add_counts(*point_votes, mask_reports, states, visibility, table, counts)
     probability = np.empty(table_start[-1], np.float32)
     _normalize(report_column, state_row, table_start, counts, probability)
     return replace(tables, probability=probability)
@@ -315,17 +308,16 @@ def _view_report(of_mask, e, end, group, mask_view, view, vote):  # noqa: ANN001
 
 
 @njit(cache=True)
-def _add_counts(masks, views, low, mask_reports, candidates, visibility, table, counts):  # noqa: ANN001, ANN202
-    """Adds to ``counts`` what views report of the points from ``low`` on, weighted by visibility squared. Returns the
-    point after the last."""
+def _add_counts(masks, views, mask_reports, candidates, visibility, table, counts):  # noqa: ANN001, ANN202
+    """Adds to ``counts`` what views report of the points, weighted by visibility squared."""
     (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, mask_reports
     (start, state, probability), (report_column, state_row, table_start) = candidates, table
     background = report_column.shape[1] - 1
-    for i in range(len(mask_start) - 1):
-        g, e = low + i, mask_start[i]
-        for v in range(view_start[i], view_start[i + 1]):
+    for g in range(len(mask_start) - 1):
+        e = mask_start[g]
+        for v in range(view_start[g], view_start[g + 1]):
             view, first_mask = of_view[v].row, e
-            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
+            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[g + 1], group, mask_view, view, of_view[v].vote)
             no_mask_column = report_column[view, background]
             for c in range(start[g], start[g + 1]):
                 if probability[c] == 0:
@@ -337,7 +329,6 @@ def _add_counts(masks, views, low, mask_reports, candidates, visibility, table, 
                     if k >= 0:
                         counts[row + report_column[view, k]] += np.rint(weight * of_mask[m].vote) / _FIXED_POINT_SCALE
                 counts[row + no_mask_column] += np.rint(weight * no_mask) / _FIXED_POINT_SCALE
-    return low + len(mask_start) - 1
 
 
 @njit(cache=True)
@@ -371,38 +362,35 @@ def _with_floor(probability):  # noqa: ANN001, ANN202
 
 
 def _unary_potentials(
-    point_votes: VotesOfPoints,
+    point_votes: PointVotes,
     mask_reports: tuple[NDArray[np.int32], NDArray[np.int32]],
     candidates: LikelyStates,
     visibility: NDArray[np.float32],
     reports: ViewReports,
 ) -> NDArray[np.float64]:
     """(candidates,) log-prior plus log-likelihood of each, up to a constant for each point."""
-    unary, low = np.where(candidates.state == candidates.background, BACKGROUND_LOG_PRIOR, 0.0), 0
+    unary = np.where(candidates.state == candidates.background, BACKGROUND_LOG_PRIOR, 0.0)
     possible = _possible_reports(mask_reports, reports.report_column.shape)
     table = reports.report_column, reports.state_row, reports.table_start, reports.probability, possible
-    for chunk in point_votes:
-        votes = chunk()
-        _add_log_likelihood(*votes, low, mask_reports, (candidates.start, candidates.state), visibility, table, unary)
-        low += len(votes[0][0]) - 1
+    states = candidates.start, candidates.state
+    _add_log_likelihood(*point_votes, mask_reports, states, visibility, table, unary)
     return unary
 
 
 @njit(cache=True, parallel=True)
-def _add_log_likelihood(masks, views, low, mask_reports, candidates, visibility, reports, unary):  # noqa: ANN001, ANN202
-    """Adds to ``unary`` the log-likelihood of what views report of the points from ``low`` on."""
+def _add_log_likelihood(masks, views, mask_reports, candidates, visibility, reports, unary):  # noqa: ANN001, ANN202
+    """Adds to ``unary`` the log-likelihood of what views report of the points."""
     (mask_start, of_mask), (view_start, of_view), (group, mask_view) = masks, views, mask_reports
     (start, state), (report_column, state_row, table_start, probability, possible) = candidates, reports
     background = report_column.shape[1] - 1
-    for i in prange(len(mask_start) - 1):
-        g, e = low + i, mask_start[i]
-        begin, end = start[g], start[g + 1]
+    for g in prange(len(mask_start) - 1):
+        e, begin, end = mask_start[g], start[g], start[g + 1]
         if end - begin < 2:
             continue  # one candidate at most: nothing to decide
         total_seen, log_likelihood = 0.0, np.zeros(end - begin)
-        for v in range(view_start[i], view_start[i + 1]):
+        for v in range(view_start[g], view_start[g + 1]):
             view, first_mask = of_view[v].row, e
-            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[i + 1], group, mask_view, view, of_view[v].vote)
+            e, used_vote, no_mask = _view_report(of_mask, e, mask_start[g + 1], group, mask_view, view, of_view[v].vote)
             if used_vote <= 0:
                 continue
             p_seen, width = used_vote * visibility[g], report_column[view, background] + 1

@@ -12,9 +12,9 @@ view that sees the point best, squared. So
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,13 @@ OPENNESS_POWER = 2
 """Exponent of the relative exposure. 1 trusts too much of what shines through, 4 too little of thick surfaces."""
 
 ENTRIES_AT_ONCE = 1 << 26
-"""Votes that are sorted by point at once: half a gigabyte."""
+"""Votes that are sorted by point at once, half a gigabyte: more are sorted in passes, each writing to one region."""
 VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
 """A vote on a point, and the mask or view that casts it: used together, they share a cache line."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
 """(start, votes): the votes on point g are votes[start[g] : start[g + 1]], rows ascending."""
-VotesOfPoints = Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]]
-"""Votes in masks, and all votes of views, in chunks of ascending points that fit into memory."""
+PointVotes = tuple[_ByPoint, _ByPoint]
+"""Votes in masks, and all votes of views, by point."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,11 @@ class ViewVotes:
         """The median of ``openness`` over points that are seen at all; 0 without one."""
         seen = self.openness[self.openness > 0]
         return float(np.median(seen)) if len(seen) else 0.0
+
+    @cached_property
+    def by_point(self) -> PointVotes:
+        """The votes in masks, and the votes of views, sorted by point; in files where the votes are."""
+        return _by_point(self.in_mask), _by_point(self.vote)
 
 
 def view_votes(table: MaskTable) -> ViewVotes:
@@ -113,32 +118,31 @@ def _split_votes(first_mask, weights, outside, votes, n, in_mask):  # noqa: ANN0
             in_mask[e] = weight[e] * factor[weight_index[e]]
 
 
-def votes_of_points(votes: ViewVotes) -> VotesOfPoints:
-    """The votes by point; cached if they are all in one chunk."""
-    in_mask, vote = votes.in_mask, votes.vote
-    n, runs = in_mask.shape[1], 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
-    bounds = [(n * run // runs, n * (run + 1) // runs) for run in range(runs)]
-    sort = [partial(lambda low, high: (_by_point(in_mask, low, high), _by_point(vote, low, high)), *b) for b in bounds]
-    return sort if runs > 1 else [cache(sort[0])]
-
-
-def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
-    """Columns low to high of a matrix."""
-    return _columns(matrix.indptr, matrix.indices, matrix.data, low, matrix.shape[1] if high is None else high)
+def _by_point(matrix: csr_array) -> _ByPoint:
+    n, runs = matrix.shape[1], 1 + matrix.nnz // ENTRIES_AT_ONCE
+    start, votes = _starts(matrix.indices, n), scratch_like(matrix.data, VOTE)
+    for low, high in pairwise(n * run // runs for run in range(runs + 1)):
+        _sort_columns(matrix.indptr, matrix.indices, matrix.data, (low, high), start[low:high], votes)
+    return start, votes
 
 
 @njit(cache=True)
-def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
-    start = np.zeros(high - low + 1, np.int64)
-    for e in range(len(indices)):
-        if low <= indices[e] < high:
-            start[indices[e] - low + 1] += 1
-    start = np.cumsum(start)
-    end, votes = start[:-1].copy(), np.empty(start[-1], VOTE)
+def _starts(columns, n):  # noqa: ANN001, ANN202
+    """(n + 1,) where the entries of each column begin if they are sorted by column."""
+    start = np.zeros(n + 1, np.int64)
+    for column in columns:
+        start[column + 1] += 1
+    return np.cumsum(start)
+
+
+@njit(cache=True)
+def _sort_columns(indptr, indices, data, columns, start, votes):  # noqa: ANN001, ANN202
+    """Writes the entries of ``columns``, from the first to before the last, to ``votes``, where each column's begin at
+    ``start``."""
+    (low, high), end = columns, start.copy()
     for row in range(len(indptr) - 1):
         for e in range(indptr[row], indptr[row + 1]):
             if low <= indices[e] < high:
                 vote = votes[end[indices[e] - low]]
                 vote["row"], vote["vote"] = row, data[e]
                 end[indices[e] - low] += 1
-    return start, votes
