@@ -198,17 +198,20 @@ def test_box_and_scenes_restrict(folder):
             (f.scene, f.instance) for f in inside
         ]
     assert not collection.find("lamp", within=([500, 0, 0], [501, 1, 1]))
-    with pytest.raises(OgPointcloudError, match="no scene is called 'room9'"):
-        collection.find("lamp", scenes="room9")
-    for top in (0, 2.5, "3"):
-        with pytest.raises(OgPointcloudError, match=r"top is .*; expected a whole number, at least 1"):
-            collection.find("lamp", top=top)
-    with pytest.raises(OgPointcloudError, match="expected at least one word"):
-        collection.find(5)
-    with pytest.raises(OgPointcloudError, match="no scene is named"):
-        collection.find("lamp", scenes=[])
-    with pytest.raises(OgPointcloudError, match="the low one first"):
-        collection.find("lamp", within=(high, low))
+
+
+@pytest.mark.parametrize(("option", "values", "says"), [
+    ("words", [5, None, [], ["mug", " "], [["mug"]], {}], "expected at least one word or phrase"),
+    ("scenes", [5, [], [None], "", [["site0"]]], "expected at least one name or pattern, or None for all"),
+    ("scenes", ["room9"], "no scene is called 'room9'"),
+    ("top", [0, 2.5, "3", None], "top is .*; expected a whole number, at least 1"),
+    ("within", [5, [[0, 0, 0], [1, 1]], (["a"] * 3, ["b"] * 3), ([1j] * 3, [2j] * 3), ([0, 0, 0], [0, -1, 0]),
+                ([np.nan] * 3, [1] * 3)], "expected two corners of three numbers, the low one first"),
+])  # fmt: skip
+def test_arguments_of_other_kinds_are_one_error(judged, option, values, says):
+    for value in values:
+        with pytest.raises(OgPointcloudError, match=says):
+            judged[1].find(**{"words": "lamp", option: value})
 
 
 def test_places_are_those_of_the_instances(folder):

@@ -6,7 +6,7 @@ import fnmatch
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -166,42 +166,35 @@ class Collection:
         """
         if not isinstance(top, Integral) or top < 1:
             raise OgPointcloudError(f"top is {top!r:.40}; expected a whole number, at least 1")
-        names = tuple(dict.fromkeys(words if isinstance(words, Iterable) and not isinstance(words, str) else (words,)))
-        if not names or not all(isinstance(name, str) and name.strip() for name in names):
-            raise OgPointcloudError(f"the words are {names!r:.80}; expected at least one word or phrase")
+        names = _texts("words", words, "at least one word or phrase")
+        patterns = None if scenes is None else _texts("scenes", scenes, "at least one name or pattern, or None for all")
         features = None if text_features is None else words_of(text_features)
         given = None
         if isinstance(words, Mapping):
             arrays = {name: numbers_of(vector) for name, vector in words.items()}
             given = resolve_labels(arrays, None, None, UNKNOWN_SPACE)
         box = None if within is None else _corners(within)
-        scenes = scenes if scenes is None or isinstance(scenes, str) else tuple(scenes)
+        query = _Query(names, features, given, patterns, box, top)
         self._open()
         try:
-            return self._found(names, features, given, _Query(self._ids(scenes), box, top))
+            return self._found(query)
         except OgPointcloudError:
             before = self._stamp
             self._open()
             if self._stamp == before:
                 raise
             # Another process changed the atlas meanwhile: what was read of it belongs to what it was.
-            return self._found(names, features, given, _Query(self._ids(scenes), box, top))
+            return self._found(query)
 
-    def _found(
-        self,
-        names: tuple[str, ...],
-        features: tuple[Vocabulary, str] | None,
-        given: Vocabulary | None,
-        query: _Query,
-    ) -> Findings:
-        """Arguments as in `_vectors`."""
+    def _found(self, query: _Query) -> Findings:
+        query = replace(query, ids=self._ids(query.patterns))
         asked = [group for group in self._groups if query.scenes_of(group)]
-        vectors = [self._vectors(group.family, names, features, given) for group in asked]
+        vectors = [self._vectors(group.family, query) for group in asked]
         if not any(vectors):
-            if given is not None and asked:
+            if query.given is not None and asked:
                 space = FeatureSpace(asked[0].family.feature_space, asked[0].family.width)
-                space.require(FeatureSpace(UNKNOWN_SPACE, given.vectors.shape[1]), "label vectors")
-            raise _unanswerable(names[0], [group.family for group in asked])
+                space.require(FeatureSpace(UNKNOWN_SPACE, query.given.vectors.shape[1]), "label vectors")
+            raise _unanswerable(query.words[0], [group.family for group in asked])
         # The best of each group and word, then the best of all: (sort key, finding).
         ranked = [
             pair
@@ -213,7 +206,7 @@ class Collection:
         # Scenes that could not be asked for a word, by word and feature space.
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
-            for word in set(names) - known.keys():
+            for word in set(query.words) - known.keys():
                 counts[word, group.family.feature_space] += len(query.scenes_of(group))
         not_asked = tuple(
             f"{counted(count, 'scene')} of feature space '{space}' could not be searched for '{word}': its vector "
@@ -222,12 +215,12 @@ class Collection:
         )
         return Findings((finding for _, finding in ranked[: query.top]), not_asked)
 
-    def _ids(self, scenes: str | Iterable[str] | None) -> set[int] | None:
+    def _ids(self, patterns: tuple[str, ...] | None) -> set[int] | None:
         """Ids of the scenes that names or patterns match; None, meaning all, stays None."""
-        if scenes is None:
+        if patterns is None:
             return None
         ids: set[int] = set()
-        for pattern in (scenes,) if isinstance(scenes, str) else scenes:
+        for pattern in patterns:
             fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
             if not fitting:
                 raise OgPointcloudError(
@@ -235,27 +228,19 @@ class Collection:
                     f"of a scene in {self.path} ({len(self.entries):,}), or a pattern"
                 )
             ids.update(self._by_name[name].id for name in fitting)
-        if not ids:
-            raise OgPointcloudError("no scene is named; expected at least one name or pattern, or None for all scenes")
         return ids
 
-    def _vectors(
-        self,
-        family: Family,
-        names: Iterable[str],
-        features: tuple[Vocabulary, str] | None,
-        given: Vocabulary | None,
-    ) -> dict[str, NDArray[np.float32]]:
-        """Unit vectors of the words that these scenes can be asked for. given: vectors of the user, used
-        exclusively."""
+    def _vectors(self, family: Family, query: _Query) -> dict[str, NDArray[np.float32]]:
+        """Unit vectors of the words that these scenes can be asked for."""
+        given, features = query.given, query.features
         if given is not None:
             fits = given.vectors.shape[1] == family.width
             return dict(zip(given.names, unit_rows(given.vectors), strict=True)) if fits else {}
         known = family.words
         if features is not None and (features[1], features[0].vectors.shape[1]) == (family.feature_space, family.width):
             known = known | dict(zip(features[0].names, unit_rows(features[0].vectors), strict=True))
-        vectors = {name: known[name] for name in names if name in known}
-        missing = [name for name in names if name not in known]
+        vectors = {name: known[name] for name in query.words if name in known}
+        missing = [name for name in query.words if name not in known]
         if missing and (encoder := self._encoder(family)) is not None and encoder.width == family.width:
             vectors |= dict(zip(missing, encoder(missing), strict=True))
         return vectors
@@ -302,12 +287,17 @@ class Collection:
 
 @dataclass(frozen=True)
 class _Query:
-    """Filters of a query. ids: of the queried scenes, None for all. box: (2, 3) corners that the instance's center must
-    lie between, None for anywhere. top: maximum number of findings."""
+    """A query. features: vectors of words in a feature space; given: vectors of the words themselves, used exclusively.
+    patterns: of the queried scenes' names, and ids: of these scenes, None for all. box: (2, 3) corners that the
+    instance's center must lie between, None for anywhere. top: maximum number of findings."""
 
-    ids: set[int] | None
+    words: tuple[str, ...]
+    features: tuple[Vocabulary, str] | None
+    given: Vocabulary | None
+    patterns: tuple[str, ...] | None
     box: NDArray[np.float64] | None
     top: int
+    ids: set[int] | None = None
 
     def scenes_of(self, group: Group) -> Sequence[SceneEntry]:
         """The scenes of a group that are queried."""
@@ -316,9 +306,19 @@ class _Query:
         return [group.by_id[id] for id in sorted(self.ids & group.by_id.keys())]
 
 
+def _texts(what: str, given: Any, expected: str) -> tuple[str, ...]:
+    """Distinct texts, in order: one or several. OgPointcloudError for anything else, an empty text or none."""
+    texts = [*given] if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else [given]
+    if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
+        raise OgPointcloudError(f"the {what} are {given!r:.80}; expected {expected}")
+    return tuple(dict.fromkeys(texts))
+
+
 def _corners(within: Any) -> NDArray[np.float64]:
     """(2, 3) low and high corner."""
-    corners = np.asarray(within, np.float64) if np.shape(within) == (2, 3) else np.full((2, 3), np.nan)
+    corners = numbers_of(within)
+    if corners.shape != (2, 3) or corners.dtype.kind not in "fiu":
+        corners = np.full((2, 3), np.nan)
     if not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
         raise OgPointcloudError(f"within is {within!r:.120}; expected two corners of three numbers, the low one first")
     return corners

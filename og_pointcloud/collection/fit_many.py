@@ -157,7 +157,10 @@ def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> Capture
     try:
         return future.result()
     except Exception as error:  # of the executor: a task returns its own
-        cause = f"its worker died ({type(error).__name__}: {error!s:.160}); out of memory, or killed?"
+        cause = (
+            f"its worker died ({type(error).__name__}: {error!s:.160}), as one does that runs out of memory; expected "
+            "workers that finish their tasks: take fewer, with more memory each, or limit that of a fit (--memory)"
+        )
         return CaptureFit(str(capture), str(output), "failed", cause, worker=LOST)
 
 

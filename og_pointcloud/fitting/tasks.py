@@ -70,7 +70,7 @@ def run_tasks(
     executor: Executor | None, journal: Journal, function: Callable[[Item], Result], items: Sequence[Item], name: str
 ) -> list[Result]:
     """The function's value for each item, in order: computed here, one after another, or by an executor's workers.
-    OgPointcloudError if a worker of `concurrent.futures` dies."""
+    OgPointcloudError if a worker dies."""
     if executor is None:
         return [function(item) for item in journal.steps(items, name)]
     futures = [executor.submit(_with_share, function, item) for item in items]
@@ -79,7 +79,7 @@ def run_tasks(
     except BaseException as error:  # Ctrl-C too: cancel what has not begun
         for future in futures:
             future.cancel()
-        if not isinstance(error, BrokenExecutor):
+        if not isinstance(error, BrokenExecutor) and type(error).__name__ != "KilledWorker":  # of Dask
             raise
         raise OgPointcloudError(
             "a worker died, as one does that runs out of memory; expected workers that finish their tasks: take fewer "
