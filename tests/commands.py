@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import Any
 
 from og_pointcloud.cli import main
@@ -22,6 +23,12 @@ def output_of(capsys: Any, *arguments: object) -> str:
     code, stdout, stderr = run(capsys, *arguments)
     assert code == 0, stderr
     return stdout
+
+
+def next_command(stdout: str) -> list[str]:
+    """The words of the command that an output says to type next."""
+    (line,) = [line for line in stdout.splitlines() if line.startswith("next: ")]
+    return shlex.split(line[line.index("og-pointcloud ") :])[1:]
 
 
 def error_of(capsys: Any, *arguments: object) -> str:

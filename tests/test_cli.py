@@ -1,7 +1,6 @@
 """The commands from end to end on a tiny capture, and what they answer to bad use and bad input."""
 
 import json
-import shlex
 import shutil
 import subprocess
 import sys
@@ -9,15 +8,8 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from commands import error_of, output_of, run
-from scenes import (
-    COLORS,
-    NAMES,
-    UNUSED_NAME,
-    sample_surfaces,
-    write_ply,
-    write_tiny_capture,
-)
+from commands import error_of, next_command, output_of, run
+from scenes import COLORS, NAMES, UNUSED_NAME, sample_surfaces, write_ply, write_tiny_capture
 from test_opengaussian import WIDTH as LEAF_WIDTH
 from test_opengaussian import write_result
 
@@ -119,9 +111,7 @@ def test_what_a_pose_moves_leaves_its_attributes_behind(fitted, tmp_path, capsys
 
 def test_segment_json_counts_every_point(fitted, capsys):
     capture, bundle = fitted
-    code, stdout, _ = run(capsys, "segment", bundle, "--json")
-    report = json.loads(stdout)
-    assert code == 0
+    report = json.loads(output_of(capsys, "segment", bundle, "--json"))
     assert sum(report["counts"].values()) + report["unknown"] == report["points"] == len(capture.object_ids)
 
 
@@ -133,10 +123,10 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
     assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
     assert report["stages"][0]["name"] == "read capture"
     assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
-    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
+    command = next_command(stdout)
     assert ",".join(NAMES) in command
-    assert command.endswith("tiny_labels.ply"), "tiny.ply may be the cloud that was fitted"
-    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+    assert command[-1].endswith("tiny_labels.ply"), "tiny.ply may be the cloud that was fitted"
+    output_of(capsys, *command)
 
 
 def test_the_next_command_asks_for_what_is_there(tiny_capture, tmp_path, capsys):
@@ -145,8 +135,7 @@ def test_the_next_command_asks_for_what_is_there(tiny_capture, tmp_path, capsys)
     stored = dict(np.load(file))
     unused_first = {name: stored[name][::-1] for name in ("names", "vectors")}
     np.savez(file, **{**stored, **unused_first})
-    stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
-    command = shlex.split(next(line for line in stdout.splitlines() if line.startswith("next: ")))
+    command = next_command(output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc"))
     assert set(command[command.index("--labels") + 1].split(",")) == set(NAMES)
 
 
@@ -159,8 +148,7 @@ def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsy
     (tiny_capture.folder / "text_features.npz").unlink()
     stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
     assert "no words are known yet" in stdout
-    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
-    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+    output_of(capsys, *next_command(stdout))
 
 
 def test_a_cut_image_is_one_line(tiny_capture):
@@ -193,11 +181,9 @@ def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys, monk
         ("instances", bundle, "-o", tmp_path / "a.csv"),
         ("find", tmp_path / "atlas", "red ball", "--html", tmp_path / "found.html"),
     ):
-        stdout = output_of(capsys, *command)
-        *_, last = stdout.splitlines()
-        assert last.startswith("next: "), command
-        assert ("--text-features" in last) == ("--text-features" in command)
-        assert run(capsys, *shlex.split(last[last.index("og-pointcloud ") :])[1:])[0] == 0, last
+        proposed = next_command(output_of(capsys, *command))
+        assert ("--text-features" in proposed) == ("--text-features" in command)
+        output_of(capsys, *proposed)
         if command[0] != "view":
             assert "next: " not in run(capsys, *command, "--json")[1]
 
@@ -316,13 +302,6 @@ def test_a_demo_leaves_the_captures_of_others(tmp_path, monkeypatch, capsys):
     assert len(made) == 2, "and one that was interrupted"
 
 
-def rewrite_npz(path, **changes):
-    """The same .npz with some entries replaced."""
-    with np.load(path) as archive:
-        entries = {**archive, **changes}
-    np.savez(path, **entries)
-
-
 def turn_cameras_away(folder):
     transforms = json.loads((folder / "transforms.json").read_text())
     for frame in transforms["frames"]:
@@ -358,19 +337,16 @@ def test_one_view_is_enough(tmp_path, capsys):
 
 def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     """The capture's own is left out and said so; one that was asked for is an error."""
-    rewrite_npz(tiny_capture.text_features, feature_space=np.array("another space"))
+    words = {**np.load(tiny_capture.text_features), "feature_space": np.array("another space")}
+    np.savez(tiny_capture.text_features, **words)
     bundle = tmp_path / "s.ogpc"
     stdout = output_of(capsys, "fit", tiny_capture.folder, "-o", bundle)
     assert {0, 1} <= set(load(bundle).instance_ids), "without words there are instances"
     assert "left out: vocabulary" in stdout
     assert "another space" in stdout
     assert json.loads(run(capsys, "info", bundle, "--json")[1])["words"] == []
-    error = error_of(
-        capsys, "fit", tiny_capture.folder, "-o", bundle, "--vocabulary", tiny_capture.text_features
-    )  # fmt: skip
-    assert "another space" in error
-    error = error_of(capsys, "segment", bundle, "--text-features", tiny_capture.text_features)
-    assert "another space" in error
+    for command in (("fit", tiny_capture.folder, "-o", bundle, "--vocabulary"), ("segment", bundle, "--text-features")):
+        assert "another space" in error_of(capsys, *command, tiny_capture.text_features)
 
 
 def test_segment_knows_the_endings_that_results_are_saved_with():
@@ -401,9 +377,7 @@ def test_a_pixel_selects_the_ball_it_shows(fitted, tmp_path, capsys):
     for mask, (u, v) in enumerate(middles):
         output = tmp_path / f"{mask}.png"
         click = ("--capture", capture.folder, "--view", name, "--pixel", f"{u},{v}", "-o", output)
-        code, stdout, _ = run(capsys, "pick", bundle, *click, "--json")
-        report = json.loads(stdout)
-        assert code == 0
+        report = json.loads(output_of(capsys, "pick", bundle, *click, "--json"))
         assert report["found"]
         truth = capture.object_ids[cloud.instance_ids == report["instance"]]
         ball = int(capture.object_ids[report["point"]])
@@ -451,9 +425,8 @@ def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     assert "iteration_90000" in stdout
     assert "in 4 instances" in stdout
     assert "2 of 4 instances have no feature" in stdout
-    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
-    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
-    assert run(capsys, "info", bundle)[0] == 0
+    output_of(capsys, *next_command(stdout))
+    output_of(capsys, "info", bundle)
     error = error_of(capsys, *arguments[:5], "another space", *arguments[6:])
     assert "encode them with that encoder" in error
     np.savez(words, names=np.array(["cup"]), vectors=np.ones((1, 3)))

@@ -308,7 +308,8 @@ class _Query:
 
 def _texts(what: str, given: Any, expected: str) -> tuple[str, ...]:
     """Distinct texts, in order: one or several. OgPointcloudError for anything else, an empty text or none."""
-    texts = [*given] if isinstance(given, Iterable) and not isinstance(given, (str, bytes)) else [given]
+    several = isinstance(given, Iterable) and not isinstance(given, (str, bytes))
+    texts: list[Any] = [*given] if several else [given]
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
         raise OgPointcloudError(f"the {what} are {given!r:.80}; expected {expected}")
     return tuple(dict.fromkeys(texts))
