@@ -28,6 +28,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -126,16 +127,14 @@ def read_photographed(folder: str | Path, points: Points | None = None) -> Scene
     capture = Path(folder)
     poses = read_poses(capture)
     if points is None:
-        has_file = poses.ply_file_path or _find_cloud(capture) or colmap.find_model(capture)
-        if not has_file:
+        if not (poses.ply_file_path or _find_cloud(capture) or colmap.find_model(capture)):
             return None
         points = read_geometry(capture, poses)
     views = []
     for name, image in zip(poses.names, poses.images, strict=True):
-        camera, file = in_local_frame(image.camera, points.origin), find_image(capture, image.path)
-        photograph = None if file is None else partial(read_photograph, file, camera, image.face)
-        no_masks = partial(np.full, (camera.height, camera.width), -1, np.int32)
-        views.append(View(name, camera, no_masks, np.zeros((0, 0), np.float32), photograph))
+        size = image.camera.width, image.camera.height
+        no_masks = MaskLayer(size, np.zeros((0, 0), np.float32), partial(np.full, size[::-1], -1, np.int32))
+        views.append(_view(name, image, no_masks, find_image(capture, image.path), points.origin))
     return Scene(points, tuple(views), UNKNOWN_SPACE, name=capture.resolve().name)
 
 
@@ -235,9 +234,7 @@ def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
         f"{capture}: {len(has_mask) - sum(has_mask)} of {len(has_mask)} images have no masks and are left out",
         stacklevel=3,
     )
-    kept = [pair for pair, has in zip(zip(poses.names, poses.images, strict=True), has_mask, strict=True) if has]
-    names, images = zip(*kept, strict=True)
-    return replace(poses, names=names, images=images)
+    return replace(poses, names=tuple(compress(poses.names, has_mask)), images=tuple(compress(poses.images, has_mask)))
 
 
 def _has_mask(capture: Path, name: str) -> bool:

@@ -111,4 +111,4 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
 
 
 PHONE_LAYOUTS = ((_is_polycam, _polycam), (_is_scanner_app, _scanner_app), (_is_arkit_scenes, _arkit_scenes))
-"""As `rgbd.LAYOUTS`."""
+"""Of `rgbd.LAYOUTS`."""

@@ -42,8 +42,9 @@ def read_points(path: StrPath) -> Points:
         found = _read(path)
         if isinstance(found, Points):
             return found
-        placed = _placed(path, positions(found), "left out")
-        return Points.from_world(positions(found)[placed], rgb=colors(found[placed]))
+        xyz = positions(found)
+        placed = _placed(path, xyz, "left out")
+        return Points.from_world(xyz[placed], rgb=colors(found[placed]))
 
 
 def read_places(path: StrPath) -> NDArray[np.float64]:
@@ -54,9 +55,10 @@ def read_places(path: StrPath) -> NDArray[np.float64]:
         found = _read(path)
         if isinstance(found, Points):
             return found.xyz_world
-        if len(found):
-            _placed(path, positions(found), "unknown")
-        return positions(found)
+        xyz = positions(found)
+        if len(xyz):
+            _placed(path, xyz, "unknown")
+        return xyz
 
 
 def _placed(path: Path, xyz: NDArray[np.float64], then: str) -> NDArray[np.bool_]:

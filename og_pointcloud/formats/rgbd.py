@@ -55,7 +55,7 @@ def read_rgbd(folder: Path) -> PosedFrames | None:
 
     SceneError names the faulty file and the cure.
     """
-    return next((recorded(read(folder)) for holds, read in (*LAYOUTS, *PHONE_LAYOUTS) if holds(folder)), None)
+    return next((recorded(read(folder)) for holds, read in LAYOUTS if holds(folder)), None)
 
 
 def _is_scannet(folder: Path) -> bool:
@@ -186,6 +186,7 @@ LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Iterable[RecordedF
     (_is_seven_scenes, _seven_scenes),
     (_is_replica, _replica),
     (is_kitti360, read_kitti360),
+    *PHONE_LAYOUTS,
 )
 """Pairs of functions, one that tests whether a folder has a layout and one that reads it; the first match is used. To
 add a layout, add a pair."""

@@ -103,11 +103,17 @@ def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
 # Files -------------------------------------------------------------------------------------------------------------
 
 
-def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed: int) -> list[int]:
-    """Bytes of the columns, harmonics last; SceneError if the header cannot be right. packed: bytes of the file."""
-    if data != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MAX_FRACTION_BITS:
+def _header(head: bytes, packed: int) -> tuple[int, int, int, list[int]]:
+    """Number of splats, fraction bits, number of columns (version 4), and the bytes of each column, harmonics last.
+
+    SceneError if the header cannot be right. packed: bytes of the file.
+    """
+    if len(head) < HEADER.size:
+        raise SceneError(f"its header ends after {len(head)} bytes: copy or export it again")
+    magic, version, count, degree, bits, _, columns = HEADER.unpack_from(head)
+    if magic != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MAX_FRACTION_BITS:
         raise SceneError(
-            f"its header says {data!r}, version {version}, degree {degree}, {bits} fraction bits; expected 'NGSP', "
+            f"its header says {magic!r}, version {version}, degree {degree}, {bits} fraction bits; expected 'NGSP', "
             f"version 2 to 4, at most {len(HARMONICS) - 1} and {MAX_FRACTION_BITS}: export it again"
         )
     if count == 0:
@@ -118,18 +124,14 @@ def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed
         raise SceneError(
             f"it claims {count} splats, {sum(sizes)} bytes, in a file of {packed}: it is made to fill memory"
         )
-    return sizes
+    return count, bits, columns, sizes
 
 
 def _unpacked(data: bytes) -> tuple[int, int, list[Bytes]]:
     """Number of splats, fraction bits and columns of versions 2 and 3."""
     stream = zlib.decompressobj(wbits=31)  # with gzip's header
     try:
-        head = stream.decompress(data, HEADER.size)
-        if len(head) < HEADER.size:
-            raise SceneError(f"its header ends after {len(head)} bytes: copy or export it again")
-        magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
-        sizes = _sizes(magic, version, count, degree, bits, len(data))
+        count, bits, _, sizes = _header(stream.decompress(data, HEADER.size), len(data))
         body = stream.decompress(stream.unconsumed_tail, sum(sizes))
     except zlib.error as error:
         raise SceneError(f"not a whole gzip ({error!s:.80}): copy or export it again") from None
@@ -142,10 +144,7 @@ def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
     """As `_unpacked`, for version 4: a table of packed and unpacked sizes, 64 bits each, then the columns."""
     with naming_extra("zstandard", "spz"):
         import zstandard
-    if len(data) < HEADER.size + 4:
-        raise SceneError(f"its header ends after {len(data)} bytes: copy or export it again")
-    magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)
-    sizes = _sizes(magic, version, count, degree, bits, len(data))
+    count, bits, streams, sizes = _header(data, len(data))
     table = int.from_bytes(data[HEADER.size : HEADER.size + 4], "little")
     start, columns = table + 16 * streams, []
     if streams < 5 or start > len(data):
