@@ -16,10 +16,10 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
-from og_pointcloud.evaluate.scannet import read_truth
+from og_pointcloud.evaluate.scannet import TASKS, read_truth, score_scene
 from og_pointcloud.formats.ply import write_ply
 
-WALL, FLOOR, CHAIR = 1, 2, 5
+WALL, FLOOR, CHAIR, PICTURE, OTHER = 1, 2, 5, 11, 40
 
 
 # Captures -------------------------------------------------------------------------------------------------------
@@ -40,9 +40,8 @@ def fitted(tmp_path_factory) -> Path:
 
 
 def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
-    command = ["eval", "capture", str(fitted / "tiny"), str(fitted / "S.ogpc")]
-    outputs = ["--json", str(tmp_path / "s.json")]
-    out = output_of(capsys, *command, "--against", fitted / "worse.ogpc", *outputs)
+    command = ("eval", "capture", fitted / "tiny", fitted / "S.ogpc", "--against", fitted / "worse.ogpc")
+    out = output_of(capsys, *command, "--json", tmp_path / "s.json")
     entry = json.loads((tmp_path / "s.json").read_text())["tiny"]
     words = fitted / "tiny/text_features.npz"
     result = og.segment(og.load(fitted / "S.ogpc"), None, text_features=words)
@@ -119,15 +118,54 @@ def scannet(tmp_path) -> Path:
     return tmp_path
 
 
-def command(scannet, *more):
-    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
-    return ["eval", "scannet", str(scannet / "scans"), *folders, *more]
+def command(scannet, *more, truth="scans"):
+    folders = ["--predictions", scannet / "p", "--text-features", scannet / "w.npz"]
+    return ["eval", "scannet", scannet / truth, *folders, *more]
+
+
+def scored(capsys, scannet, *more, **truth):
+    """What the command prints, and the scores that it writes."""
+    out = output_of(capsys, *command(scannet, "--json", scannet / "s.json", *more, **truth))
+    return out, json.loads((scannet / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def test_the_tasks_are_those_of_the_table():
+    assert [len(TASKS[task]) for task in (19, 15, 10)] == [19, 15, 10]
+    assert set(TASKS[10]) < set(TASKS[15]) < set(TASKS[19]) == set(NYU40)
+
+
+def test_one_scene_by_hand():
+    truth = np.repeat([WALL, CHAIR, OTHER, 0], [6, 4, 3, 2])
+    # Wall: 4 right, 1 called chair, 1 unknown. Chair: 3 right, 1 called wall. The rest is ignored, whatever is said.
+    predicted = np.array([1, 1, 1, 1, 5, 0, 5, 5, 5, 1, 1, 5, 5, 1, 1])
+    score = score_scene(predicted, truth, 19)
+    # Wall: hits 4, union 6 true + 1 chair called wall = 7. Chair: hits 3, union 4 + 1 wall called chair = 5.
+    assert score.class_iou == (4 / 7, 3 / 5)
+    assert score.class_accuracy == (4 / 6, 3 / 4)
+    assert (score.points, score.unknown_share) == (10, 1 / 10)
+
+
+def test_transparent_points_count_nowhere():
+    truth, predicted = np.repeat([WALL, CHAIR], [4, 2]), np.repeat([WALL, CHAIR], [2, 4])
+    opacity = np.array([1, 1, 0.09, 0.1, 1, 1])
+    score = score_scene(predicted, truth, 10, opacity)
+    # Ignored: point 2. Wall: hits 2 of 3; chair: hits 2, union 2 + 1 (0.1 is not below 0.1).
+    assert score.class_iou == (2 / 3, 2 / 3)
+
+
+def test_absent_classes_do_not_dilute_and_classes_outside_the_task_are_ignored():
+    truth = np.repeat([WALL, PICTURE], 2)
+    # Floor is called on a wall point: wrong for the wall, but floor is absent and has no IoU of 0.
+    predicted = np.array([WALL, FLOOR, PICTURE, WALL])
+    assert score_scene(predicted, truth, 19).class_iou == (1 / 3, 1 / 2)
+    # Picture is not among the 10: its points, and the wall called there, count nowhere.
+    ten = score_scene(predicted, truth, 10)
+    assert (ten.classes, ten.class_iou) == ((WALL,), (1 / 2,))
 
 
 def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    out = capsys.readouterr().out
-    report = json.loads((scannet / "s.json").read_text())["19"]
+    out, report = scored(capsys, scannet)
+    report = report["19"]
     # Scene 0: wall 2 of 2, chair 1 of 2. Scene 62: wall 1 of 2, floor 2 of 2; of its 4 one is unknown.
     assert report["scenes"]["scene0000_00"]["class_iou"] == {"1": 1.0, "5": 0.5}
     assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.5, "2": 1.0}
@@ -146,12 +184,11 @@ def test_a_scene_that_abstains_is_also_scored_as_if_it_might_not(scannet, capsys
     bank[:20] = np.eye(3, WIDTH, dtype=np.float32)[1] + 0.3 * bank[:20] / np.linalg.norm(bank[:20], axis=1)[:, None]
     for file in (scannet / "p").glob("*.ogpc"):
         og.write_bundle(replace(og.load(file).cloud, word_bank=WordBank(bank)), file)
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    report = json.loads((scannet / "s.json").read_text())["19"]
-    assert report["scenes"]["scene0062_00"]["class_iou"]["2"] == 0
-    assert report["forced_miou"] == pytest.approx(0.75)  # as without a bank, above
-    assert report["miou"] < 0.75
-    assert "forced" in capsys.readouterr().out
+    out, report = scored(capsys, scannet)
+    assert report["19"]["scenes"]["scene0062_00"]["class_iou"]["2"] == 0
+    assert report["19"]["forced_miou"] == pytest.approx(0.75)  # as without a bank, above
+    assert report["19"]["miou"] < 0.75
+    assert "forced" in out
 
 
 def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
@@ -159,20 +196,15 @@ def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
     xyz = np.arange(4)[:, None] * np.array([1.0, 0, 0])
     write_labels(scannet / "other", "scene0000_00", xyz, [36, 36, 40, 0])
     write_labels(scannet / "other", "scene0062_00", xyz, [WALL, WALL, 40, 0])
-    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
-    folders = ["eval", "scannet", str(scannet / "other"), *folders]
-    assert main([*folders, "--json", str(scannet / "s.json")]) == 0
-    report = json.loads((scannet / "s.json").read_text())
+    _, report = scored(capsys, scannet, truth="other")
     assert (report["19"]["miou"], report["10"]["miou"]) == (0.25, 0.5)  # bathtub 0 of 2; wall 1 of 2
     assert report["10"]["scenes"]["scene0000_00"] == {
         "miou": None, "macc": None, "forced_miou": None, "unknown": None, "points": 0, "class_iou": {},
     }  # fmt: skip
     assert report["10"]["interval"] == [0.5, 0.5]
-    capsys.readouterr()
-    assert main([*folders, "--scenes", "scene0000_00", "--json", str(scannet / "s.json")]) == 0
-    ten = json.loads((scannet / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))["10"]
-    assert (ten["miou"], ten["forced_miou"], ten["unknown"], ten["interval"]) == (None,) * 4
-    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("10 classes"))
+    out, report = scored(capsys, scannet, "--scenes", "scene0000_00", truth="other")
+    assert [report["10"][name] for name in ("miou", "forced_miou", "unknown", "interval")] == [None] * 4
+    row = next(line for line in out.splitlines() if line.startswith("10 classes"))
     assert set(row.split()[2:]) == {"-"}
 
 
@@ -183,14 +215,12 @@ def test_a_missing_or_empty_scene_is_one_error(scannet, capsys):
     assert str(prediction) in error_of(capsys, *command(scannet))
     prediction.unlink()
     assert "has no scene0062_00.ogpc" in error_of(capsys, *command(scannet))
-    assert main(command(scannet, "--scenes", "scene0000_00")) == 0
+    output_of(capsys, *command(scannet, "--scenes", "scene0000_00"))
 
 
 def test_labels_that_are_not_nyu40_are_one_error(scannet, capsys):
     write_labels(scannet / "raw", "scene0000_00", np.zeros((2, 3)), [WALL, 1191])
-    folders = ("--predictions", scannet / "p", "--text-features", scannet / "w.npz")
-    line = error_of(capsys, "eval", "scannet", scannet / "raw", *folders)
-    assert "labels span 1..1191; expected NYU40" in line
+    assert "labels span 1..1191; expected NYU40" in error_of(capsys, *command(scannet, truth="raw"))
 
 
 def test_ids_that_scannet_left_by_mistake_are_of_no_class(tmp_path):
@@ -199,14 +229,12 @@ def test_ids_that_scannet_left_by_mistake_are_of_no_class(tmp_path):
     assert read_truth(file)[1].tolist() == [WALL, 0, 0]
 
 
-def test_points_that_lie_in_one_place_count_each(scannet):
+def test_points_that_lie_in_one_place_count_each(scannet, capsys):
     """ScanNet's meshes repeat vertices: three floors in one place, of which one is labelled wall, are three points."""
     truth = [WALL, WALL, FLOOR, FLOOR, FLOOR, WALL]
     xyz = np.array([0, 1, 2, 3, 3, 3])[:, None] * np.array([1.0, 0, 0])
     write_labels(scannet / "twice", "scene0062_00", xyz, truth)
-    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
-    assert main(["eval", "scannet", str(scannet / "twice"), *folders, "--json", str(scannet / "s.json")]) == 0
-    scene = json.loads((scannet / "s.json").read_text())["19"]["scenes"]["scene0062_00"]
+    scene = scored(capsys, scannet, truth="twice")[1]["19"]["scenes"]["scene0062_00"]
     # Said are wall, nothing, floor, floor, floor, floor. Wall: 1 of 3. Floor: 3 of 3 + 1.
     assert scene["class_iou"] == {"1": pytest.approx(1 / 3), "2": 3 / 4}
     assert scene["points"] == 6

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import error_of, run
+from commands import error_of, output_of, run
 from labelled_clouds import SPACE, make_cloud
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, InstanceTable, WordBank
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, score_pairs
+from og_pointcloud.evaluate.lerf import gaussians_of, pair_ious, read_frame, read_scene, score_pairs
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.scene import Points
@@ -43,11 +42,13 @@ def outline(column, row, side):
     return [[column, row], [column + last, row], [column + last, row + last], [column, row + last]]
 
 
-def write_labels(folder: Path, scene: str, frame: str, objects) -> None:
-    (folder / "label" / scene).mkdir(parents=True, exist_ok=True)
+def write_labels(folder: Path, scene: str, frame: str, objects) -> Path:
+    file = folder / "label" / scene / f"{frame}.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
     info = {"name": f"{frame}.jpg", "width": WIDTH, "height": HEIGHT}
     entries = [{"category": name, "segmentation": corners} for name, corners in objects]
-    (folder / "label" / scene / f"{frame}.json").write_text(json.dumps({"info": info, "objects": entries}))
+    file.write_text(json.dumps({"info": info, "objects": entries}))
+    return file
 
 
 def write_poses(folder: Path, scene: str, shifts: dict[str, float], scale: int = 1) -> None:
@@ -112,10 +113,38 @@ def command(data, *more):
     return ["eval", "lerf", str(data / "d"), *[str(data / x) if not x.startswith("-") else x for x in paths], *more]
 
 
+def scored(capsys, data, *more):
+    """What the command prints, and the scores that it writes."""
+    out = output_of(capsys, *command(data, "--json", data / "s.json", *more))
+    return out, json.loads((data / "s.json").read_text())
+
+
+def test_selection_by_hand(tmp_path):
+    cups = [("cup", outline(0, 0, 4)), ("cup", outline(10, 0, 2))]
+    frame = read_frame(write_labels(tmp_path, "kitchen", "frame_00041", [*cups, ("fork", outline(5, 5, 3))]))
+    assert frame.name == "frame_00041"
+    # Two cups are one object of 16 + 4 pixels.
+    assert {name: int(mask.sum()) for name, mask in frame.objects.items()} == {"cup": 20, "fork": 9}
+    alpha = np.zeros((10, 20))
+    alpha[0:4, 0:4], alpha[9, 0:5], alpha[0, 10] = 0.71, 0.9, 0.7
+    # Shown: 16 of the cups and 5 elsewhere; 0.7 is not above 0.7. IoU 16 / 25. Nothing is selected of the fork: 0.
+    assert pair_ious(frame, {"cup": alpha, "fork": np.zeros((10, 20))}) == {"cup": 16 / 25, "fork": 0.0}
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"info": {"name": "a", "width": 1e9, "height": 1e9}, "objects": []}'])
+def test_damaged_label_files_are_refused(tmp_path, content):
+    (tmp_path / "f.json").write_text(content)
+    with pytest.raises(SceneError, match=r"f\.json"):
+        read_frame(tmp_path / "f.json")
+
+
+def test_an_outline_of_two_corners_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="object 'cup': the outline is"):
+        read_frame(write_labels(tmp_path, "kitchen", "f", [("cup", [[0, 0], [1, 1]])]))
+
+
 def test_a_miniature_data_set_by_hand(data, capsys):
-    assert main(command(data, "--json", str(data / "s.json"))) == 0
-    out = capsys.readouterr().out
-    report = json.loads((data / "s.json").read_text())
+    out, report = scored(capsys, data)
     pairs = {(p["frame"], p["object"]): p["iou"] for p in report["scenes"]["figurines"]}
     # The cup is outlined as it is: 16 of 16. From 1 to the right it is seen 1 to the left, its first column outside the
     # image: 12 pixels within the outline's 16.
@@ -160,24 +189,22 @@ def test_frames_without_objects_and_objects_outside_the_image(data, capsys):
     the image has no pixel: nothing can be found of it, and it scores 0."""
     write_labels(data / "d", "figurines", "frame_00099", [("duck", outline(-30, -30, 4))])
     write_labels(data / "d", "teatime", "frame_00002", [])
-    assert main(command(data, "--json", str(data / "s.json"))) == 0
-    report = json.loads((data / "s.json").read_text())
+    out, report = scored(capsys, data)
     assert report["scenes"]["teatime"] == []
     (outside,) = [pair for pair in report["scenes"]["figurines"] if pair["frame"] == "frame_00099"]
     assert set(outside["iou"].values()) == {0}
     best = report["means"]["best"]
     assert best["miou"] == pytest.approx((1 + 1 / 2 + 1 / 9 + 3 / 4 + 0) / 5)
-    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("teatime"))
+    row = next(line for line in out.splitlines() if line.startswith("teatime"))
     assert row.split() == ["teatime", "0", *"-" * 4]
     assert "no labeled object in any frame" in error_of(capsys, *command(data, "--scenes", "teatime"))
 
 
-def test_a_scene_without_instances_selects_nothing(data):
+def test_a_scene_without_instances_selects_nothing(data, capsys):
     """Nothing is an answer, and scores 0."""
     cloud = og.load(data / "p/teatime.ogpc").cloud
     og.write_bundle(replace(cloud, instance_ids=np.full(len(cloud), BACKGROUND, np.int32)), data / "p/teatime.ogpc")
-    assert main(command(data, "--scenes", "teatime", "--json", str(data / "s.json"))) == 0
-    (pair,) = json.loads((data / "s.json").read_text())["scenes"]["teatime"]
+    (pair,) = scored(capsys, data, "--scenes", "teatime")[1]["scenes"]["teatime"]
     assert pair["iou"] == {"best": 0, "calibrated": 0}
 
 
@@ -205,9 +232,8 @@ def test_gaussians_that_lie_in_one_place_are_one_to_the_eye(data):
 )
 def test_a_missing_file_is_one_error(remove, text, data, capsys):
     (data / remove).rename(data / "gone")
-    code, out, _ = run(capsys, *command(data))
-    assert (code, out) == (2, "")
-    assert text in error_of(capsys, *command(data))
+    code, out, error = run(capsys, *command(data))
+    assert (code, out, text in error) == (2, "", True)
     if remove.endswith(".ogpc"):  # neither is a file of no bytes a prediction
         (data / remove).write_bytes(b"")
         assert remove in error_of(capsys, *command(data))

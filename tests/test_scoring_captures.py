@@ -77,6 +77,17 @@ def test_instances_of_the_truth_are_read_and_checked(tmp_path):
 # Intervals ------------------------------------------------------------------------------------------------------
 
 
+def test_an_interval_is_as_wide_as_the_standard_error_says():
+    hard = np.random.default_rng(1).uniform(0, 1, 40)
+    alone = bootstrap(hard)
+    # The standard error of a mean is deviation / root n; 95 % lie within 1.96 of them.
+    assert (alone.high - alone.low) / 2 == pytest.approx(1.96 * hard.std() / np.sqrt(40), rel=0.1)
+    assert bootstrap(hard) == alone
+    assert bootstrap(np.array([0.5, np.nan])) == bootstrap(np.array([0.5]))
+    with pytest.raises(OgPointcloudError, match="no finite score"):
+        bootstrap(np.array([np.nan]))
+
+
 def test_the_mean_of_an_interval_is_the_score():
     rng = np.random.default_rng(0)
     cls, called = rng.integers(-1, 2, 4000), rng.integers(-1, 3, 4000)
