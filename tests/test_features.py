@@ -120,11 +120,11 @@ def worst_errors(scene: Rendered, settings: FeatureSettings, dtype: type) -> tup
     """Relative error of the objective and of its gradient (to the largest entry), fast in dtype, literal in float64."""
     values = np.random.default_rng(1).uniform(size=(scene.table.weights.shape[1], WIDTH)).astype(dtype)
     problem = FeatureObjective(scene.table, settings)
-    terms = problem.terms(values[problem.shown], CLOSEST)
+    found, pulled = problem.at(values[problem.shown], CLOSEST)
     objective, gradient = literal(scene, settings, values.astype(np.float64))
     full = np.zeros_like(gradient)
-    full[problem.shown] = terms.gradient
-    return abs(terms.objective / objective - 1), float(np.abs(full - gradient).max() / np.abs(gradient).max())
+    full[problem.shown] = pulled
+    return abs(found / objective - 1), float(np.abs(full - gradient).max() / np.abs(gradient).max())
 
 
 @pytest.mark.slow
@@ -151,9 +151,8 @@ def test_in_exact_weights_the_quadratic_form_is_exact() -> None:
 def test_points_bound_what_covered_pixels_show() -> None:
     scene = random_views()
     values = np.random.default_rng(1).uniform(size=(40, WIDTH))
-    problem = FeatureObjective(scene.table, FeatureSettings())
-    total = np.asarray(scene.table.weights.sum())
-    bound = problem.terms(values[problem.shown], CLOSEST).cohesion * total
+    problem = FeatureObjective(scene.table, FeatureSettings(inter=False, cohesion_weight=1))
+    bound = problem.at(values[problem.shown], CLOSEST)[0] * np.asarray(scene.table.weights.sum())
     shown = 0.0
     means = iter(problem.mask_means(values[problem.shown]))
     for weights, ids, count in zip(scene.weights, scene.ids, scene.mask_counts, strict=True):

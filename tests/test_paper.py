@@ -213,7 +213,6 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
     assert between > 3 * max(np.linalg.norm(ball - ball.mean(axis=0), axis=1).mean() for ball in (red, blue))
 
     book = train_codebook(balls.gaussians, balls.views, trained.raw, settings)
-    assert ((book.leaf // settings.k2 == book.coarse) | (book.leaf < 0)).all()
     np.testing.assert_array_equal(book.leaf >= 0, trained.seen > 0)
     assert book.centers.shape == (24, 6)
     sure = seen & (balls.object_ids >= 0)
@@ -250,7 +249,6 @@ def test_gaussians_that_no_mask_shows_get_neither_feature_nor_cluster(balls: Bal
     book = train_codebook(hidden, balls.views, trained.raw, settings)
     assert (trained.seen[:10] == 0).all()
     assert (trained.features[:10] == 0).all()
-    assert (book.coarse[:10] == -1).all()
     assert (book.leaf[:10] == -1).all()
     assert (book.leaf[trained.seen > 0] >= 0).all()
 

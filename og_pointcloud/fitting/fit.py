@@ -230,9 +230,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             "views_side_by_side": at_once,
         }
         if work.found:  # views of an interrupted fit
-            journal.leave_out(
-                LeftOut.RENDERING, count=work.found, folder="" if work.folder is None else work.folder.name
-            )
+            journal.leave_out(LeftOut.RENDERING, count=work.found, folder=work.place().name)
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
         # Areas were counted in pixels of the thinned images.
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)

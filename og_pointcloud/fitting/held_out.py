@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.fitting.grouping import group_masks
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
+from og_pointcloud.fitting.mask_table import MaskTable, areas_by_instance, mask_table
 from og_pointcloud.fitting.membership import assign_by_votes_alone
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
@@ -130,10 +130,7 @@ def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
 
     ids: (n,) int32, the instance of each point, below 0 none; count: how many instances there are.
     """
-    shared = weights_by_instance(table.weights, ids, count)
-    # What a view shows of an instance lies in its masks or outside all of them.
-    in_view = weights_by_instance(table.outside, ids, count)
-    np.add.at(in_view, table.mask_view, shared)
+    shared, in_view = areas_by_instance(table, ids, count)
     area = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     if count == 0 or area.sum() == 0:
         return 0.0

@@ -85,13 +85,13 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
     """Features by Eq. 1 and 2, codebook by Eq. 3, masks by Eq. 5, all from the mask table."""
     with journal.stage("features"):
         learned = learn_features(table, settings.features, settings.seed)
+        journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
     with journal.stage("codebook"):
         xyz = surface.scene.points.xyz
         book = two_level_codebook(learned.features, xyz, learned.seen, table, settings.codebook, settings.seed)
-        if book.levels == 1:
+        coarse, leaves = journal.notes["clusters"] = [book.coarse_count, len(book.leaf_centers)]
+        if coarse == leaves:
             journal.leave_out(LeftOut.SECOND_LEVEL)
-    journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
-    journal.notes["clusters"] = [len(book.coarse_centers), len(book.leaf_centers)]
     with journal.stage("matching"):
         # A mask's P_j of Eq. 5 is the mean of what it shows, an instance's M_i its leaf's center.
         shown = mask_means(table, learned.features)

@@ -136,7 +136,7 @@ def mask_table(
         *matrices,
         np.repeat(np.arange(len(views_shown), dtype=np.int32), [len(view.pixels) for view in views_shown]),
         np.concatenate([view.pixels for view in views_shown]),
-        _stacked([view.mask_features for view in views_shown]),
+        stacked_features([view.mask_features for view in views_shown]),
         stacked_tracks([(view.mask_tracks, len(view.pixels)) for view in views_shown]),
         tuple(view.name for view in views_shown),
     )
@@ -217,10 +217,9 @@ def _put_together(
     return weights, unmasked, exposure
 
 
-def _stacked(features: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Mask features of all views; a view without masks may give rows of any width."""
-    width = max((rows.shape[1] for rows in features), default=0)
-    return np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for rows in features])
+def stacked_features(of_views: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """`MaskTable.mask_features` from those of each view, whose rows may have any width where it has no masks."""
+    return np.concatenate([features for features in of_views if len(features)] or of_views[:1])
 
 
 def stacked_tracks(of_views: Sequence[tuple[NDArray[np.integer] | None, int]]) -> NDArray[np.int64] | None:
@@ -254,6 +253,17 @@ def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], coun
     instance_ids: (n,) int32, the instance of each column, less than ``count``; below 0 none.
     """
     return _weights_by_instance(matrix.indptr, matrix.indices, matrix.data, instance_ids, count)
+
+
+def areas_by_instance(
+    table: MaskTable, instance_ids: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What every mask, (masks, count), and every view, (views, count), shows of each instance, as above."""
+    in_masks = weights_by_instance(table.weights, instance_ids, count)
+    # What a view shows of an instance lies in its masks or outside all of them.
+    in_views = weights_by_instance(table.outside, instance_ids, count)
+    np.add.at(in_views, table.mask_view, in_masks)
+    return in_masks, in_views
 
 
 @njit(cache=True)

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.cloud import InstanceTable, unit_rows
-from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.labellers import Labelling, grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
@@ -149,10 +148,7 @@ def _again(
 def _named_by(table: MaskTable, surface: Surface, looks: _Looks, settings: FitSettings) -> NDArray[np.int64]:
     """(n,) the instance whose look is nearest to what labels made from these views alone give each point, -1 none."""
     # By grouping, whatever the mode: it needs no training.
-    try:
-        found = grouping(table, surface, settings, Journal(progress=False))
-    except SceneError:
-        return np.full(len(surface.gaussians), -1)
+    found = grouping(table, surface, settings, Journal(progress=False))
     directions, described = looks.of(found.instances)
     name = np.append(np.where(described, looks.nearest(directions), -1), -1)  # the last: of points without an instance
     return name[np.maximum(found.instance_ids, -1)]
@@ -183,8 +179,6 @@ def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int
 
 def _cut(matrix: csr_array, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> csr_array:
     """Some rows and columns of a matrix, a few rows at a time: the whole may be larger than memory."""
-    if not len(rows):
-        return csr_array((0, len(columns)), dtype=matrix.dtype)
     chosen = slice(None) if len(columns) == matrix.shape[1] else columns
     cuts = [csr_array(matrix[rows[low : low + ROWS_PER_CUT]])[:, chosen] for low in range(0, len(rows), ROWS_PER_CUT)]
     return csr_array(vstack(cuts, format="csr"))

@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,14 @@ from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
+from og_pointcloud.fitting.mask_table import (
+    MaskTable,
+    mask_table,
+    require_sight,
+    stacked_features,
+    stacked_tracks,
+    view_fingerprint,
+)
 from og_pointcloud.fitting.membership import SceneVotes, assign_and_mark_spanning, assign_points
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
@@ -87,8 +93,6 @@ POINT_FIT_BYTES = 1_000
 POINT_CLOUD_BYTES = 120
 """Memory of the cloud whatever the tiles, in bytes per point: positions, colors, spacings, ids, order."""
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Rows = NDArray[np.integer]
 Floats = NDArray[np.float32]
 Entries = NDArray[np.void]
@@ -275,11 +279,9 @@ def _stacked(
 def _all_shown(scene: Scene, cloud: TiledCloud, rendered: Sequence[_RenderedView], journal: Journal) -> _Shown:
     """What the views show, all in the work folder. SceneError where no view shows a point, or no mask does."""
     if found := sum(view.was_there for view in rendered):
-        folder = "" if cloud.work.folder is None else cloud.work.folder.name
-        journal.leave_out(LeftOut.RENDERING, count=found, folder=folder)
+        journal.leave_out(LeftOut.RENDERING, count=found, folder=cloud.work.place().name)
     for view in rendered:
         cloud.work.adopt("view", view.key)
-    masks = [view.mask_features for view in scene.views if view.mask_count]
     require_sight(sum(int(view.first[-1]) for view in rendered), sum(view.masked for view in rendered), scene)
     drawn, inside = np.sum([view.drawn for view in rendered], axis=0).tolist()
     if drawn < inside:
@@ -293,7 +295,7 @@ def _all_shown(scene: Scene, cloud: TiledCloud, rendered: Sequence[_RenderedView
         keys,
         first,
         mask_view,
-        np.concatenate(masks),
+        stacked_features([view.mask_features for view in scene.views]),
         stacked_tracks([(view.mask_tracks, view.mask_count) for view in scene.views]),
         Photographs.of(scene.views),
         sight_ratios(np.sum([view.colors for view in rendered], axis=0)),

@@ -31,7 +31,7 @@ def eq2_gradient(distance: float) -> Answer:
     weights = np.ones((MASKS, 600), np.float32)
     weights += (distance * np.random.default_rng(1).normal(size=weights.shape) * 10).astype(np.float32)
     weights = np.abs(weights)
-    terms = FeatureObjective(mask_table_of(weights, [0] * MASKS), RAW).terms(features, closest=0)
+    _, gradient = FeatureObjective(mask_table_of(weights, [0] * MASKS), RAW).at(features, closest=0)
     size = weights.astype(np.longdouble).sum(axis=1, keepdims=True)
     means = weights.astype(np.longdouble) @ features / size
     pull = np.zeros_like(means)
@@ -46,7 +46,7 @@ def eq2_gradient(distance: float) -> Answer:
         total = weights.sum(axis=1, keepdims=True)
         return (weights / total).T @ naive.eq2_gradient(weights @ features / total) / np.float32(largest)
 
-    return Answer(terms.gradient / float(largest), exact, plain)
+    return Answer(gradient / float(largest), exact, plain)
 
 
 @agrees(1e-5, "spread of the features in a mask", powers(0, -5, -1))
@@ -55,8 +55,9 @@ def eq1_value(spread: float) -> Answer:
     random = np.random.default_rng(0)
     weights = np.where(random.random((4, 3000)) < 0.5, random.random((4, 3000)), 0).astype(np.float32)
     features = (0.5 + spread * random.normal(size=(3000, 6))).astype(np.float32)
-    objective = FeatureObjective(mask_table_of(weights, [0, 0, 1, 1]), FeatureSettings(inter=False))
-    cohesion = objective.terms(features[objective.shown], closest=1).cohesion
+    eq1_alone = FeatureSettings(inter=False, cohesion_weight=1.0)
+    objective = FeatureObjective(mask_table_of(weights, [0, 0, 1, 1]), eq1_alone)
+    cohesion, _ = objective.at(features[objective.shown], closest=1)
     wide, size = weights.astype(np.longdouble), weights.astype(np.longdouble).sum(axis=1)
     means = wide @ features / size[:, None]
     exact = sum((w * np.square(features - mean).sum(axis=1)).sum() for w, mean in zip(wide, means, strict=True))

@@ -31,17 +31,18 @@ STARTS = 4
 class Codebook:
     """Two levels of clusters of n Gaussians; the leaves are the fine ones, in the order of their coarse clusters.
 
-    coarse, leaf: (n,) int32, -1 for Gaussians without weight. coarse_centers (k1, width), leaf_centers (k, width)
-    float32, mean features. leaf_coarse: (k,) int32, ascending. levels: 1 where each coarse cluster is one leaf.
-    No cluster is empty.
+    leaf: (n,) int32, -1 for Gaussians without weight. leaf_centers: (k, width) float32, mean features. leaf_coarse:
+    (k,) int32, ascending, the coarse cluster of each leaf. No cluster is empty.
     """
 
-    coarse: NDArray[np.int32]
     leaf: NDArray[np.int32]
-    coarse_centers: NDArray[np.float32]
     leaf_centers: NDArray[np.float32]
     leaf_coarse: NDArray[np.int32]
-    levels: int
+
+    @property
+    def coarse_count(self) -> int:
+        """The number of coarse clusters, which is that of leaves where each is one leaf."""
+        return int(self.leaf_coarse.max(initial=-1)) + 1
 
 
 def two_level_codebook(
@@ -78,14 +79,9 @@ def two_level_codebook(
         fine, k2 = _clusters(values[members], mass[members], int(fine_count[cluster]), settings.rounds, rng)
         leaf[taking_part[members]] = fine + len(leaf_coarse)
         leaf_coarse += [cluster] * k2
-    return Codebook(
-        coarse,
-        leaf,
-        _means(values, mass, coarse[taking_part], k1),
-        _means(values, mass, leaf[taking_part], len(leaf_coarse)),
-        np.array(leaf_coarse, np.int32),
-        2 if len(leaf_coarse) > k1 else 1,
-    )
+    sums, of_leaf = _cluster_sums(values, mass, leaf[taking_part], len(leaf_coarse))
+    centers = (sums / of_leaf[:, None]).astype(np.float32)
+    return Codebook(leaf, centers, np.array(leaf_coarse, np.int32))
 
 
 def thing_count(table: MaskTable) -> int:
@@ -230,14 +226,6 @@ def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> N
     low, middle, high = np.quantile(xyz, [0.05, 0.5, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(xyz, axis=0))) or 1.0
     return (settings.position_weight * np.clip((xyz - middle) / extent, -1, 1)).astype(np.float32)
-
-
-def _means(
-    values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
-) -> NDArray[np.float32]:
-    """(count, d) weighted means of clusters; none may be empty."""
-    sums, mass = _cluster_sums(values, weight, own, count)
-    return (sums / mass[:, None]).astype(np.float32)
 
 
 def _cluster_sums(

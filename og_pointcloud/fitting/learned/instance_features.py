@@ -62,16 +62,6 @@ Pair = tuple[NDArray[np.float32], NDArray[np.float32], float]
 
 
 @dataclass(frozen=True)
-class Terms:
-    """cohesion: Eq. 1 over all masked pixels. objective: the weighted sum of Eq. 2, as a mean over views, and Eq. 1,
-    without terms that are off. gradient: of the objective, (n, width) in the features' dtype."""
-
-    cohesion: float
-    objective: float
-    gradient: NDArray[np.floating]
-
-
-@dataclass(frozen=True)
 class LearnedFeatures:
     """Features of n Gaussians and how they were found.
 
@@ -170,8 +160,11 @@ class FeatureObjective:
         """(k, width): for each Gaussian the mean of the masks' rows, weighted by how much of it each shows."""
         return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
 
-    def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
-        """Both losses at features (k, width) as read, Eq. 2 bounded below the distance ``closest``."""
+    def at(self, features: NDArray[np.floating], closest: float) -> tuple[float, NDArray[np.floating]]:
+        """The objective, without terms that are off, at features (k, width) as read, and its gradient, in their dtype.
+
+        closest: the bound e of Eq. 2.
+        """
         settings, views = self.settings, len(self._first) - 1
         features = np.ascontiguousarray(features)
         means = self.mask_means(features)
@@ -181,13 +174,12 @@ class FeatureObjective:
         # Eq. 1 as the difference of the two sums above: one depends on features, one on means.
         factor, total = settings.intra * settings.cohesion_weight, self._size.sum()
         blended = self.seen[self.shown, None] * features
-        spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
-        cohesion = float(spread / total)
+        cohesion = float((features * blended).sum() - (self._size[:, None] * means**2).sum()) / total
         # Chain rule: means are diag(1 / N) A F, so their gradient comes back to the features by A' diag(1 / N).
         pull = (pull + factor * (-2 / total * self._size[:, None] * means)) / self._size[:, None]
         gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * (2 / total * blended)
         objective = settings.inter * separation + factor * cohesion
-        return Terms(cohesion, objective, gradient.astype(features.dtype))
+        return objective, gradient.astype(features.dtype)
 
 
 def _minimise(
@@ -203,8 +195,8 @@ def _minimise(
     # 0.26 s on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
     def evaluate(raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
         normalize = problem.settings.normalize
-        terms = problem.terms(read_features(raw, normalize), closest)
-        return terms.objective, raw_gradient(raw, terms.gradient, normalize)
+        objective, gradient = problem.at(read_features(raw, normalize), closest)
+        return objective, raw_gradient(raw, gradient, normalize)
 
     pairs: list[Pair] = []
     value, gradient = evaluate(raw)

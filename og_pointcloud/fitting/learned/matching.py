@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.spatial.distance import cdist
 
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.association import directions
-from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
+from og_pointcloud.fitting.mask_table import MaskTable, areas_by_instance
 from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, render
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
@@ -73,16 +74,8 @@ def visible_evidence(
     (masks, width), the mean instance feature that each mask shows (not the encoder's).
     A mask's area is what it shows of the cloud: pixels that show no point do not count.
     """
-    count = len(instance_features)
-    shared = weights_by_instance(table.weights, instance_ids, count)
-    # What a view shows of an instance lies in its masks or outside all of them.
-    instance_area = weights_by_instance(table.outside, instance_ids, count)
-    np.add.at(instance_area, table.mask_view, shared)
-    # One channel at a time: all differences at once would be (masks, K, width).
-    distance = np.zeros_like(shared)
-    for of_masks, of_instances in zip(mask_features.T, instance_features.T, strict=True):
-        distance += np.abs(of_masks[:, None].astype(np.float64) - of_instances)
-    distance[shared == 0] = np.inf
+    shared, instance_area = areas_by_instance(table, instance_ids, len(instance_features))
+    distance = np.where(shared > 0, cdist(mask_features, instance_features, "cityblock"), np.inf)
     return Evidence(shared, np.asarray(table.weights.sum(axis=1), np.float64), instance_area, distance)
 
 

@@ -133,10 +133,9 @@ class TrainedFeatures:
 
 @dataclass(frozen=True)
 class TrainedCodebook:
-    """coarse: (n,) int32 in 0..k1-1. leaf: (n,) int32, ``coarse * k2 + fine``; both -1 where no mask shows the point.
-    centers: (k1 k2, width) float32; rows of leaves without Gaussians are zero. histories: coarse and fine stage."""
+    """leaf: (n,) int32, ``coarse * k2 + fine``, coarse in 0..k1-1; -1 where no mask shows the point. centers: (k1 k2,
+    width) float32; rows of leaves without Gaussians are zero. histories: coarse and fine stage."""
 
-    coarse: NDArray[np.int32]
     leaf: NDArray[np.int32]
     centers: NDArray[np.float32]
     histories: tuple[StageHistory, StageHistory]
@@ -247,11 +246,11 @@ def train_codebook(
     own_fine, fine_centers = training.train(fine, fine_centers, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
     leaf_of_center = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
-    coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
-    coarse_ids[known], leaf[known] = own, leaf_of_center[own_fine]
+    leaf = np.full(len(gaussians), -1, np.int32)
+    leaf[known] = leaf_of_center[own_fine]
     table = np.zeros((k1 * settings.k2, raw.shape[1]), np.float32)
     table[leaf_of_center] = training.read(torch.as_tensor(fine_centers, device="cpu")).numpy()
-    return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
+    return TrainedCodebook(leaf, table, (coarse, fine))
 
 
 @dataclass(frozen=True)
