@@ -218,7 +218,7 @@ def test_what_lies_beyond_the_rim_of_a_lens_is_not_held_against_the_poses():
     assert verdicts(check_poses(turned)) == {"poses": "ok", "alignment": "doubt"}
 
 
-@pytest.mark.parametrize(("width", "height"), [(97, 71), (71, 97), (1000, 761), (33, 21)])
+@pytest.mark.parametrize(("width", "height"), [(97, 71), (71, 97), (1000, 761), (33, 21), (2000, 40)])
 def test_images_of_any_size_are_compared_on_the_grid_of_what_is_seen(width, height):
     scene = with_views(
         tiled_room(2, **SMALL),

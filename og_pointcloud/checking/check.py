@@ -128,12 +128,12 @@ def check_words(cloud: LabelledCloud) -> Check:
     return Check("words", "ok", says)
 
 
-def warn_of_doubts(checks: Sequence[Check], capture: str = "CAPTURE", stacklevel: int = 2) -> None:
+def warn_of_doubts(checks: Sequence[Check], capture: str = "CAPTURE") -> None:
     """A `CaptureWarning` for each doubt. capture: its folder, for the repair command."""
     for check in checks:
         if check.verdict == "doubt":
             cure = f"; try: og-pointcloud repair {capture} {check.repair}" if check.repair else ""
-            warnings.warn(f"{check.name}: {check.says}{cure}", CaptureWarning, stacklevel=stacklevel + 1)
+            warnings.warn(f"{check.name}: {check.says}{cure}", CaptureWarning, stacklevel=3)
 
 
 def with_checks(cloud: LabelledCloud, checks: Sequence[Check]) -> LabelledCloud:
@@ -171,10 +171,10 @@ def _unreadable(sample: Sample, photographs: Photographs | None) -> list[Check]:
     used = {view.name for view in photographs.sample.views} if photographs else set()
     given = [view for view in sample.views if view.image is not None and sample.rgb is not None]
     found = unreadable(view for view in given if view.name not in used)
-    says = (
-        f"{len(found)} of {len(given)} that were sampled cannot be read, and are not used: {found[0]}" if found else ""
-    )
-    return [Check("photographs", "doubt", says)] if found else []
+    if not found:
+        return []
+    says = f"{len(found)} of {len(given)} that were sampled cannot be read, and are not used: {found[0]}"
+    return [Check("photographs", "doubt", says)]
 
 
 def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:
@@ -248,11 +248,11 @@ def _alignment(photographs: Photographs | None) -> Check:
     if photographs is None or len(photographs.images) < MIN_ALIGNED_VIEWS:
         says = f"it needs at least {MIN_ALIGNED_VIEWS} photographs that fit the points' colors"
         return Check("alignment", "unchecked", says)
-    registration, name = Registration(photographs, photographs.sample.cameras), "everything"
+    registration, name = Registration(photographs), "everything"
     change = registration.best_change(name)
     # A few points show whether anything is wrong at all; more of them then show what, and how much.
     if suspicious := _is_fault(change, registration.start.error):
-        registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS_PER_VIEW)
+        registration = Registration(photographs, MORE_POINTS_PER_VIEW)
         name, change = _simplest(registration)
         change = registration.refined(name, change)
     less = 1 - change.error / max(registration.start.error, 1e-9)

@@ -47,7 +47,7 @@ def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     if single or isinstance(evidence, MaskMaps):
         return single
     # No single word or number fits: try a small motion of all cameras, then two mistakes at once.
-    registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS_PER_VIEW)
+    registration = Registration(evidence, MORE_POINTS_PER_VIEW)
     moved = registration.repair("aligned", registration.refined("aligned", registration.best_change("aligned")))
     return moved if _convinces(evidence, moved) else _best_of(evidence, _pairs())
 

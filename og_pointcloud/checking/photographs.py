@@ -101,9 +101,10 @@ def unreadable(views: Iterable[View]) -> list[str]:
 
 
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
-    """The image (H, W, ...) reduced by averaging until its longer side has at most ``side`` pixels."""
+    """The image (H, W, ...) reduced by averaging until its longer side has at most ``side`` pixels, and the shorter
+    one at least two: fewer have no gradient."""
     scale = min(1.0, side / max(image.shape[:2]))
-    return _resized(image, *(max(1, round(scale * length)) for length in image.shape[1::-1]))
+    return _resized(image, *(max(2, round(scale * length)) for length in image.shape[1::-1]))
 
 
 def _resized(image: NDArray[np.generic], width: int, height: int) -> Floats:

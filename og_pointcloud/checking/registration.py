@@ -19,7 +19,6 @@ from og_pointcloud.checking.photographs import MAX_SIDE_PX, Floats, Photographs,
 from og_pointcloud.checking.sample import seen
 from og_pointcloud.formats.poses import rotation_of_vector
 from og_pointcloud.formats.repairs import Repair
-from og_pointcloud.scene import Camera
 
 Doubles = NDArray[np.float64]
 
@@ -78,16 +77,15 @@ class SmallChange:
 
 
 class Registration:
-    """A search for small changes of these cameras, those of the photographs, by ``points`` points of each view. start:
-    no change."""
+    """A search for small changes of the photographs' cameras, by ``points`` points of each view. start: no change."""
 
-    def __init__(self, photographs: Photographs, cameras: Sequence[Camera], points: int = POINTS_PER_VIEW) -> None:
+    def __init__(self, photographs: Photographs, points: int = POINTS_PER_VIEW) -> None:
         assert photographs.sample.rgb is not None
-        self.photographs, self.cameras, self.points = photographs, cameras, points
+        self.photographs, self.cameras, self.points = photographs, photographs.sample.cameras, points
         self.xyz, self.rgb = photographs.sample.xyz, photographs.sample.rgb.astype(np.float64)
         self.middle = np.median(self.xyz, axis=0)
         # The median depth is the unit of translations, so that limits hold in every scene.
-        depths = np.concatenate([camera.project(self.xyz[::10])[1] for camera in cameras])
+        depths = np.concatenate([camera.project(self.xyz[::10])[1] for camera in self.cameras])
         self.depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
         self.finest = [_with_slopes(image) for image in photographs.images]
         self.start = self._evaluated(np.zeros(PARAMETER_COUNT))
