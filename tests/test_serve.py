@@ -299,36 +299,24 @@ def shown_in(pages, monkeypatch):
         screen.close()
 
 
+@pytest.mark.parametrize("kind", ["points", "splats"])
 @pytest.mark.parametrize(("with_points", "without", "slow"), [
     (0.02, 0.01, False), (0.9, 0.8, False), (0.9, 0.1, True), (np.inf, np.inf, False)
 ], ids=["quick", "far away", "slow", "not looked at"])  # fmt: skip
-def test_a_browser_that_draws_points_slowly_is_sent_pictures(shown_in, with_points, without, slow):
-    live, browser, screen = shown_in(with_points, without)
-    assert (screen.sends_pictures, browser.drawn.visible) == (slow, not slow)
-    live.ask("plum")
-    screen.paint(live.colors())
-    assert np.array_equal(browser.drawn.colors, live.colors()) == (not slow)
-    if slow:
-        until(lambda: browser.html)
-    else:
-        assert browser.html == ""
-        assert browser.background is None
-
-
-@pytest.mark.parametrize(("with_splats", "without", "slow"), [(0.02, 0.01, False), (0.9, 0.8, False), (0.9, 0.1, True)],
-                         ids=["quick", "far away", "slow"])  # fmt: skip
-def test_splats_that_a_browser_draws_slowly_leave_it(shown_in, with_splats, without, slow):
+def test_a_browser_that_draws_slowly_is_sent_pictures(shown_in, with_points, without, slow, kind):
     from test_formats_spz import splats
 
-    live, browser, screen = shown_in(with_splats, without, points=splats(300))
-    assert (screen.sends_pictures, browser.drawn is None) == (slow, slow)
+    live, browser, screen = shown_in(with_points, without, points=splats(300) if kind == "splats" else None)
     live.ask("plum")
     screen.paint(live.colors())
+    assert screen.sends_pictures == slow
     if slow:
         until(lambda: browser.html)
-    else:
-        assert browser.drawn.visible
-        assert np.array_equal(browser.drawn.rgbs, live.colors())
+        assert browser.drawn is None if kind == "splats" else not browser.drawn.visible
+        return
+    assert browser.drawn.visible
+    assert np.array_equal(browser.drawn.rgbs if kind == "splats" else browser.drawn.colors, live.colors())
+    assert (browser.html, browser.background) == ("", None)
 
 
 def test_a_picture_shows_the_points_as_they_are_colored(shown_in):
