@@ -301,12 +301,13 @@ def test_images_of_a_thinned_replica_have_the_poses_of_their_numbers(tmp_path):
 
 
 def test_poses_in_millimeters_with_depth_in_meters_are_doubted(tmp_path):
+    def in_millimeters(content):
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= 1000
+
     nerfstudio(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    for frame in content["frames"]:
-        for row in frame["transform_matrix"][:3]:
-            row[3] *= 1000
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    edit_poses(tmp_path, in_millimeters)
     with pytest.warns(UserWarning, match="if all depths are multiplied by 1000: state the depth unit"):
         fuse_capture(tmp_path)
     with warnings.catch_warnings():

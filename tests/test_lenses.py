@@ -38,8 +38,7 @@ COLMAP = {
 
 
 def lens(name) -> Lens:
-    made = lens_of(*LENSES[name])
-    return made
+    return lens_of(*LENSES[name])
 
 
 def pixels(camera, made, points):

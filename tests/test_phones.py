@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 from capture_files import make_world, write_colmap_text, write_images, write_masks
-from scenes import ROOM_SIZE, camera, look, room_poses, write_depth, write_image
+from scenes import ROOM_SIZE, camera, look, room_poses, write_depth, write_image, write_ply
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
-from og_pointcloud.formats.ply import join_columns, write_ply
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 WIDTH, HEIGHT = ROOM_SIZE
@@ -151,9 +150,7 @@ def test_scannet_plus_plus(tmp_path):
     (tmp_path / "images").rename(tmp_path / "dslr/resized_images")
     write_masks(tmp_path, world.names)
     (tmp_path / "scans").mkdir()
-    write_ply(
-        tmp_path / "scans/mesh_aligned_0.05.ply", {"vertex": join_columns(dict(zip("xyz", world.xyz.T, strict=True)))}
-    )
+    write_ply(tmp_path / "scans/mesh_aligned_0.05.ply", world.xyz, world.rgb)
     scene = read_capture(tmp_path)
     assert [view.name for view in scene.views] == world.names
     assert scene.views[0].image_rgb() is not None

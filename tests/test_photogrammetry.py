@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from capture_files import HEIGHT, WIDTH, make_world, same_camera, write_images, write_masks
-from scenes import write_image
+from scenes import write_image, write_ply
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import read_capture, read_poses
 from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.photogrammetry import find_photogrammetry, read_photogrammetry
-from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.scene import Camera
 
 SENSOR = """<sensor id="{id}" label="unknown" type="{type}"><resolution width="64" height="48"/>
@@ -93,13 +92,14 @@ def test_a_chunks_transform_takes_cameras_to_the_world(tmp_path, where):
         np.testing.assert_allclose(image.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9)
 
 
-def test_several_sensors_and_their_lenses(tmp_path):
+@pytest.mark.parametrize("fisheye", ["fisheye", "equidistant_fisheye"])
+def test_several_sensors_and_their_lenses(tmp_path, fisheye):
     """Metashape's p1 goes with r^2 + 2 x^2, which OpenCV calls p2; its k4 is of r^8."""
     terms = "<f>60</f><cx>0</cx><cy>0</cy><k1>0.1</k1><k2>0.2</k2><k3>0.3</k3><k4>0.4</k4><p1>0.01</p1><p2>0.02</p2>"
     sensors = [
         SENSOR.format(id=0, type="frame", terms=TERMS),
         SENSOR.format(id=1, type="frame", terms=terms),
-        SENSOR.format(id=2, type="fisheye", terms=terms),
+        SENSOR.format(id=2, type=fisheye, terms=terms),
     ]
     plain, bent, wide = read(tmp_path, document(metashape(make_world(), sensors=sensors))).images
     assert (plain.camera.fx, plain.lens) == (70.0, None)
@@ -124,7 +124,7 @@ def test_photographs_without_a_pose_are_left_out_aloud(tmp_path):
     others = '<camera id="8" sensor_id="0" label="lost"/><camera id="9" sensor_id="0" label="off" enabled="false"/>'
     write_images(tmp_path, world.names)
     write_masks(tmp_path, world.names)
-    write_ply(tmp_path / "points.ply", {"vertex": join_columns(dict(zip("xyz", world.xyz.T, strict=True)))})
+    write_ply(tmp_path / "points.ply", world.xyz, world.rgb)
     (tmp_path / "cameras.xml").write_text(document(metashape(world, cameras=others)))
     with pytest.warns(UserWarning, match=r"no finite pose for 1 of \d+ frames, which are left out, e.g. 'lost'"):
         scene = read_capture(tmp_path)
@@ -158,11 +158,6 @@ def test_components_without_a_common_world_are_refused(tmp_path, in_chunk):
             read(tmp_path, components(one, other))
         assert len(read(tmp_path, components(one, other, "false")).images) == 2
     assert len(read(tmp_path, components(placed, placed)).images) == 3
-
-
-def test_an_equidistant_fisheye_is_a_fisheye(tmp_path):
-    sensors = [SENSOR.format(id=0, type="equidistant_fisheye", terms=TERMS)]
-    assert read(tmp_path, document(metashape(make_world(), sensors=sensors))).images[0].lens.model == "fisheye"
 
 
 def test_repeated_labels_are_told_apart_by_their_groups(tmp_path):

@@ -156,7 +156,7 @@ def test_views_without_a_name_and_scenes_without_a_point_are_refused():
     ("made", "said"),
     [
         (lambda view: Points([[0, 0, 0.0]], [0, 0, 0]), r"xyz is float64 \(1, 3\).* Points.from_world\(xyz\) makes"),
-        (lambda view: Points(np.zeros((1, 3), np.float32), [0, 0, 0], [[1, 2, 3]]), "rgb is int64; expected uint8"),
+        (lambda _: Points(np.zeros((1, 3), np.float32), [0, 0, 0], [[1, 2, 3]]), "rgb is int64; expected uint8"),
         (lambda view: replace(view, mask_features=[[1.0, 0]]), r"float64 \(1, 2\); .*pass features.astype"),
         (lambda view: replace(view, mask_features=[[1.0], [1.0, 0]]), "mask_features is .*rows differ in length"),
         (lambda view: replace(view, image=[[[1, 2, 3]]]).image_rgb(), r"image is int64 \(1, 1, 3\); expected uint8"),
@@ -166,10 +166,8 @@ def test_views_without_a_name_and_scenes_without_a_point_are_refused():
     ],
 )
 def test_lists_are_told_as_the_arrays_that_they_are(made, said):
-    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
-    view = View("a", camera, np.zeros((8, 8), np.int32), np.eye(1, dtype=np.float32))
     with pytest.raises(OgPointcloudError, match=said):
-        made(view)
+        made(_view())
 
 
 def test_views_may_come_from_a_generator():
