@@ -10,7 +10,6 @@ points' middle, so map coordinates of 1e6 lose no more than their own rounding.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -128,47 +127,19 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     >>> og.oriented_box([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], up=(0, 0, 1)).size.round(3)
     array([1.414, 1.414, 0.   ])
     """
-    return oriented_boxes([points], up)[0]
-
-
-def oriented_boxes(clouds: Sequence[ArrayLike], up: ArrayLike | None = None) -> list[Box]:
-    """`oriented_box` of each of many sets of points, in their order; small sets are computed together."""
-    direction = None if up is None else unit_up(up)
-    sets = [_distinct(_checked(points))[0] for points in clouds]
-    boxes: list[Box | None] = [None] * len(sets)
-    waiting = sorted(range(len(sets)), key=lambda k: len(sets[k]))  # similar sizes together, for little padding
-    lengths = np.array([len(sets[k]) for k in waiting])
-    while waiting:
-        # As many as fit, all padded to the length of the last; three rotations of each are tried at once.
-        products = 3 * HULL_DIRECTIONS * lengths * np.arange(1, len(waiting) + 1)
-        count = max(1, int(np.searchsorted(products, MAX_PRODUCTS, side="right")))
-        batch, waiting, lengths = waiting[:count], waiting[count:], lengths[count:]
-        for k, box in zip(batch, _boxes_around([sets[k] for k in batch], direction), strict=True):
-            boxes[k] = box
-    return [box for box in boxes if box is not None]
-
-
-def _boxes_around(sets: Sequence[DoubleArray], up: DoubleArray | None) -> Iterator[Box]:
-    """The box around each set of distinct points (n, 3); sets of similar size waste least. up: unit vector, or None."""
-    middles = [xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2 for xyz in sets]
-    centered = [xyz - middle for xyz, middle in zip(sets, middles, strict=True)]
-    # A repeated point changes no extent: all sets are padded to the longest with their last point.
-    rows = np.arange(max(map(len, sets)))
-    padded = np.stack([local[np.minimum(rows, len(local) - 1)] for local in centered])
+    xyz = _distinct(_checked(points))[0]
+    middle = xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2
+    local = xyz - middle
     if up is None:
-        all_axes = _least_volume(padded, np.stack([_principal_axes(local) for local in centered]))
+        axes = _least_volume(local, _principal_axes(local))
+        axes = axes[np.argsort(-np.ptp(local @ axes.T, axis=0), kind="stable")]
     else:
-        all_axes = _rotated_about_third(padded, np.broadcast_to(upright_axes(up), (len(sets), 3, 3)))
-    for local, middle, axes in zip(centered, middles, all_axes, strict=True):
-        along = local @ axes.T
-        low, high = along.min(axis=0), along.max(axis=0)
-        if up is None:
-            order = np.argsort(-(high - low), kind="stable")
-            axes, low, high = axes[order], low[order], high[order]
-        axes = _right_handed(axes, keep_third=up is not None)
-        # A reversed axis keeps the length along it, but not where it begins.
-        center = (local @ axes.T).min(axis=0) + (high - low) / 2
-        yield Box(middle + center @ axes, high - low, axes)
+        axes = _rotated_about_third(local, upright_axes(unit_up(up)))
+    size = np.ptp(local @ axes.T, axis=0)
+    axes = _right_handed(axes, keep_third=up is not None)
+    # A reversed axis keeps the length along it, but not where it begins.
+    center = (local @ axes.T).min(axis=0) + size / 2
+    return Box(middle + center @ axes, size, axes)
 
 
 def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
@@ -260,56 +231,47 @@ def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
 
 
 def _least_volume(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
-    """(k, 3, 3) axes, as rows, of a small box around each of k sets of points (k, n, 3) near the origin. axes: (k, 3,
-    3), the initial ones."""
-    axes, thickness = axes.copy(), MIN_THICKNESS_SHARE * np.linalg.norm(np.ptp(local, axis=1), axis=1)
+    """(3, 3) axes, as rows, of a small box around points (n, 3) near the origin. axes: (3, 3), the initial ones."""
+    thickness = MIN_THICKNESS_SHARE * np.linalg.norm(np.ptp(local, axis=0))
 
-    def volumes(sets: NDArray[np.intp], axes: DoubleArray) -> DoubleArray:
-        along = axes @ local[sets].swapaxes(1, 2)
-        return (along.max(axis=2) - along.min(axis=2) + thickness[sets, None]).prod(axis=1)
+    def volume(axes: DoubleArray) -> float:
+        return float((np.ptp(axes @ local.T, axis=1) + thickness).prod())
 
-    active = np.arange(len(local))
-    smallest = volumes(active, axes)
+    smallest = volume(axes)
     for _ in range(MAX_TURNS):
-        each = np.repeat(active, 3)
-        rotated = _rotated_about_third(local[each], axes[active][:, _AXIS_CYCLES].reshape(-1, 3, 3))
-        rotated_volumes = volumes(each, rotated).reshape(-1, 3)
-        best = rotated_volumes.argmin(axis=1) + 3 * np.arange(len(active))
+        rotated = [_rotated_about_third(local, axes[cycle]) for cycle in _AXIS_CYCLES]
+        volumes = [volume(each) for each in rotated]
         # A box that is no smaller is not worth an odd orientation.
-        improved = rotated_volumes.ravel()[best] < (1 - MIN_GAIN_SHARE) * smallest[active]
-        active, best = active[improved], best[improved]
-        axes[active], smallest[active] = rotated[best], rotated_volumes.ravel()[best]
-        if not len(active):
+        if not min(volumes) < (1 - MIN_GAIN_SHARE) * smallest:
             break
+        smallest = min(volumes)
+        axes = rotated[volumes.index(smallest)]
     return axes
 
 
 def _rotated_about_third(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
-    """(k, 3, 3) axes, each triple rotated about its third axis so that the rectangle of the first two around its set of
-    points, of (k, n, 3), has the smallest area."""
-    flat = axes[:, :2] @ local.swapaxes(1, 2)  # (k, 2, n)
+    """(3, 3) axes, rotated about the third so that the rectangle of the first two around the points (n, 3) has the
+    smallest area."""
+    flat = axes[:2] @ local.T
     # The farthest points along successive directions are successive corners of the convex hull. Directions lie half a
     # step off the axes: at a side that is already flush, rounding alone would decide which end is farthest.
-    at_once = max(1, MAX_PRODUCTS // flat[:, 0].size)
-    parts = (_CIRCLE[start : start + at_once] for start in range(0, HULL_DIRECTIONS, at_once))
-    farthest = np.concatenate([(part @ flat).argmax(axis=2) for part in parts], axis=1)
-    corners = np.take_along_axis(flat, farthest[:, None], axis=2)
-    sides = np.roll(corners, -1, axis=2) - corners
-    lengths = np.hypot(sides[:, 0], sides[:, 1])
-    # Sides of zero length, between directions with the same farthest point, are sorted last.
-    order = np.argsort(lengths == 0, axis=1, kind="stable")[:, : max(1, int((lengths > 0).sum(axis=1).max()))]
-    corners, sides = (np.take_along_axis(of, order[:, None], axis=2) for of in (corners, sides))
-    lengths = np.take_along_axis(lengths, order, axis=1)
+    at_once = max(1, MAX_PRODUCTS // len(local))
+    parts = [_CIRCLE[start : start + at_once] for start in range(0, HULL_DIRECTIONS, at_once)]
+    farthest = np.concatenate([(part @ flat).argmax(axis=1) for part in parts])
+    corners = flat[:, farthest]
+    sides = flat[:, np.roll(farthest, -1)] - corners
+    lengths = np.hypot(*sides)
+    # Between directions with the same farthest point there is no side; coincident points have none at all.
+    is_side = lengths > 0
+    if not is_side.any():
+        return axes
+    corners, along = corners[:, is_side], sides[:, is_side] / lengths[is_side]
     # The smallest rectangle is flush with a side of the hull (Toussaint): one candidate per side.
-    along = sides / np.where(lengths > 0, lengths, 1)[:, None]
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    thickness = MIN_THICKNESS_SHARE * np.linalg.norm(np.ptp(corners, axis=2), axis=1)[:, None]
-    extents = (direction.swapaxes(1, 2) @ corners for direction in (along, across))
-    first, second = (extent.max(axis=2) - extent.min(axis=2) + thickness for extent in extents)
-    best = np.arange(len(axes)), slice(None), np.where(lengths > 0, first * second, np.inf).argmin(axis=1)
-    rotated = np.stack([along[best], across[best]], axis=1) @ axes[:, :2]
-    has_side = lengths[:, :1, None] > 0  # coincident points have no side
-    return np.concatenate([np.where(has_side, rotated, axes[:, :2]), axes[:, 2:]], axis=1)
+    across = along[::-1] * [[-1], [1]]
+    thickness = MIN_THICKNESS_SHARE * np.linalg.norm(np.ptp(corners, axis=1))
+    areas = (np.ptp(along.T @ corners, axis=1) + thickness) * (np.ptp(across.T @ corners, axis=1) + thickness)
+    best = areas.argmin()
+    return np.concatenate([np.array([along[:, best], across[:, best]]) @ axes[:2], axes[2:]])
 
 
 # Strays -----------------------------------------------------------------------------------------------------------

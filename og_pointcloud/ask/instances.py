@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Integral
@@ -17,7 +17,7 @@ from typing import Any, SupportsIndex, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, oriented_boxes, unit_up
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, coordinate, counted, printable
@@ -161,7 +161,7 @@ class Instances(Sequence[Instance]):
 
     def to_records(self) -> list[dict[str, Any]]:
         """A JSON-able dictionary per row (`Instance.to_dict`)."""
-        return [row.to_dict() for row in with_boxes(self)]
+        return [row.to_dict() for row in self]
 
     def to_json(self, path: StrPath | None = None) -> str:
         """The records as JSON text; also written to path, atomically, if one is given."""
@@ -187,18 +187,6 @@ class Instances(Sequence[Instance]):
         if len(self) > len(shown):
             lines.append(f"and {len(self) - len(shown)} smaller ones")
         return "\n".join([counted(len(self), "instance"), *lines])
-
-
-def with_boxes(rows: Iterable[Instance]) -> list[Instance]:
-    """The rows, with their oriented boxes computed together, which takes half the time of one after the other."""
-    rows = list(rows)
-    missing = [row for row in rows if row.points and "oriented_box" not in vars(row)]
-    for up in {id(row._up): row._up for row in missing}.values():
-        same_up = [row for row in missing if row._up is up]
-        boxes = oriented_boxes([row.xyz[row.main_part] for row in same_up], up)
-        for row, box in zip(same_up, boxes, strict=True):
-            vars(row)["oriented_box"] = box
-    return rows
 
 
 def list_instances(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.boxes import axis_aligned_box
 from og_pointcloud.ask.choosing import Reason
-from og_pointcloud.ask.instances import with_boxes
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, counted
@@ -127,7 +126,7 @@ def _instances(
     present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
     shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []
-    for row in with_boxes(instance_table(scene, up=up, words=MAX_WORDS_SHOWN)):
+    for row in instance_table(scene, up=up, words=MAX_WORDS_SHOWN):
         label, points = shown.get(row.id, (-1, 0))
         record: dict[str, Any] = {
             "id": row.id, "label": label, "points": points, "views": row.views, "words": row.words,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD, scene_name
-from og_pointcloud.ask.instances import Instance, with_boxes
+from og_pointcloud.ask.instances import Instance
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
@@ -147,7 +147,7 @@ def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
 
 def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
     """Oriented boxes as lines, without those of empty instances. colors: instance id -> RGB; None: from the id."""
-    boxes = {row.id: box for row in with_boxes(rows) if (box := row.oriented_box) is not None}
+    boxes = {row.id: box for row in rows if (box := row.oriented_box) is not None}
     if not boxes:
         return pv.PolyData()
     ids, corners = np.array([*boxes], np.int32), np.concatenate([box.corners for box in boxes.values()])
