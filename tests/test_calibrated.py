@@ -19,7 +19,6 @@ from test_choosing import Made, unit
 import og_pointcloud as og
 from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.evaluate.truth import read_truth
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -166,13 +165,6 @@ def test_labels_of_one_vector_share_nothing_and_the_first_is_answered(scene, mad
 def test_vectors_of_any_length(scene, made, size):
     result = og.segment(scene, {"a": made.texts[2].astype(np.float64) * size, "b": made.texts[7]})
     np.testing.assert_array_equal(result.labels, og.segment(scene, {"a": made.texts[2], "b": made.texts[7]}).labels)
-
-
-def test_vectors_that_cannot_be_judged(scene):
-    with pytest.raises(FeatureSpaceError, match="the vector of 'a' is zero"):
-        og.segment(scene, {"a": np.zeros(64)})
-    with pytest.raises(FeatureSpaceError, match=rf"label vectors are in .*\(dimension 3\).*'{SPACE}' \(dimension 64\)"):
-        og.segment(scene, {"a": np.ones(3)})
 
 
 @pytest.mark.parametrize(

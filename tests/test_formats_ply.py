@@ -140,11 +140,6 @@ def test_what_ply_cannot_hold_is_refused(tmp_path, elements, comments, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_columns_of_two_lengths_are_refused():
-    with pytest.raises(SceneError, match="one length"):
-        join_columns({"x": np.zeros(2), "y": np.zeros(3)})
-
-
 VERTEX = "element vertex 3\nproperty float x\n"
 LITTLE, ASCII = "ply\nformat binary_little_endian 1.0\n", "ply\nformat ascii 1.0\n"
 

@@ -148,11 +148,6 @@ def test_positions_beyond_24_bits_are_refused(tmp_path, center, size):
     assert not list(tmp_path.iterdir())
 
 
-def test_plain_points_are_refused(tmp_path):
-    with pytest.raises(SceneError, match="expected Gaussians"):
-        write_spz(tmp_path / "a.spz", Points.from_world(np.zeros((2, 3))))
-
-
 def with_header(*values, **more):
     return gzip.compress(header(*values, **more) + b"".join(columns(splats(9), 3)), mtime=0)
 

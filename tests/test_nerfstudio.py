@@ -8,7 +8,6 @@ from capture_files import edit_poses, make_world, same_camera, write_transforms
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.nerfstudio import read_transforms
-from og_pointcloud.scene import Camera
 
 
 def no_size(path):
@@ -17,17 +16,6 @@ def no_size(path):
 
 def read(folder, image_size=no_size):
     return read_transforms(folder / "transforms.json", image_size)
-
-
-@pytest.mark.parametrize("per_frame", [False, True])
-def test_opengl_camera_to_world_becomes_opencv_world_to_camera(tmp_path, per_frame):
-    world = make_world()
-    write_transforms(tmp_path, world, per_frame)
-    images = read(tmp_path).images
-    assert [image.path for image in images] == [f"images/{name}.png" for name in world.names]
-    for image, pose in zip(images, world.poses, strict=True):
-        assert same_camera(image.camera, world.camera(pose))
-        assert image.lens is None
 
 
 def test_a_point_in_front_of_the_camera_has_positive_depth(tmp_path):
@@ -77,19 +65,6 @@ def test_a_unit_without_depth_images_is_not_judged(tmp_path):
     edit_poses(tmp_path, lambda content: content["frames"][0].update(depth_file_path="d.png"))
     with pytest.raises(SceneError, match=r"the depth unit is 0\.0; expected world lengths"):
         read(tmp_path)
-
-
-def test_blender_takes_its_size_from_the_image(tmp_path):
-    world = make_world()
-    angle = 2 * np.arctan(0.5 * 200 / 250.0)
-    write_transforms(tmp_path, world, suffix="")
-    drop = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-    edit_poses(tmp_path, lambda content: [content.pop(key) for key in drop] and content.update(camera_angle_x=angle))
-    asked = []
-    images = read(tmp_path, lambda path: asked.append(path) or (200, 100)).images
-    assert asked == [f"images/{name}" for name in world.names]
-    for image, pose in zip(images, world.poses, strict=True):
-        assert same_camera(image.camera, Camera(200, 100, 250, 250, 100, 50, pose))
 
 
 def test_instant_ngp(tmp_path):
