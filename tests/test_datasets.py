@@ -214,9 +214,10 @@ def test_as_many_depth_images_are_fused_as_may_be(tmp_path, monkeypatch, most, f
     assert fuse_capture(tmp_path).frames == fused
 
 
-def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path):
+@pytest.mark.parametrize("path", ["../d0.png", "/d0.png", "C:\\scan\\d0.png"])
+def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path, path):
     nerfstudio(tmp_path)
-    edit_poses(tmp_path, lambda content: content["frames"][0].update(depth_file_path="../d0.png"))
+    edit_poses(tmp_path, lambda content: content["frames"][0].update(depth_file_path=path))
     with pytest.raises(SceneError, match="leads out of the capture folder"):
         read_poses(tmp_path)
 

@@ -41,7 +41,7 @@ from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.gaussian_ply import latest_iteration
-from og_pointcloud.formats.images import find_image, image_size, read_rgb, require_scaled, without_suffix
+from og_pointcloud.formats.images import LEADS_OUT, find_image, image_size, read_rgb, require_scaled, without_suffix
 from og_pointcloud.formats.kitti360 import find_static_cloud
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.mask_files import (
@@ -343,7 +343,7 @@ def _inside(capture: Path, path: str, source: Path) -> Path:
     """``path`` inside the capture folder; a pose file may not point elsewhere."""
     relative = posixpath.normpath(path)
     file = capture / relative
-    if relative.startswith(("/", "..")) or not file.is_file():
+    if LEADS_OUT.match(relative) or not file.is_file():
         raise SceneError(
             f"{source}: ply_file_path is '{path}', which is not a file inside the capture folder; expected one: copy "
             "the cloud there and fix the path, or name the file (--gaussians)"

@@ -18,6 +18,8 @@ from og_pointcloud.formats.atomic import write_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
+LEADS_OUT = re.compile(r"/|\.\.(?:/|$)|[A-Za-z]:/")
+"""Beginnings of normalized paths that lead out of a folder, also on Windows."""
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
 
@@ -59,10 +61,10 @@ def find_image(capture: Path, path: str) -> Path | None:
     The path is tried inside the capture folder, then inside its image folders; each also with an image suffix added. A
     path that leads out of the capture folder is never opened: the longest of its endings that is found is used.
     """
-    inside = posixpath.normpath(re.sub(r"^[A-Za-z]:/", "/", path))  # without a Windows drive
-    led_out = inside.startswith(("/", ".."))  # absolute paths of the machine that wrote the file, or worse
-    parts = [part for part in inside.split("/") if part not in ("", ".", "..")]
-    for first in range(len(parts) if led_out else min(1, len(parts))):
+    inside = posixpath.normpath(path)
+    beginning = LEADS_OUT.match(inside)  # of absolute paths on the machine that wrote the file, or worse
+    parts = [part for part in inside[beginning.end() if beginning else 0 :].split("/") if part not in ("", ".", "..")]
+    for first in range(len(parts) if beginning else min(1, len(parts))):
         for folder in ("", *IMAGE_FOLDERS):
             file = capture.joinpath(folder, *parts[first:])
             candidates = (file, *(file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES))

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
+from og_pointcloud.formats.images import LEADS_OUT
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
 from og_pointcloud.formats.poses import MAX_NUMBER, OPENGL_SIGNS, PosedFrames, PosedImage, inverse, read_json_object
 from og_pointcloud.formats.tables import naming
@@ -167,7 +168,7 @@ def _depth_path(capture: Path, keys: dict[str, Any], lens: Lens | None) -> Path 
         raise SceneError(f"{key} of an equirectangular image is not read; expected pinhole depths: remove it")
     path = keys[key]
     inside = posixpath.normpath(str(path).replace("\\", "/"))
-    if inside.startswith(("/", "..")) or "\0" in inside:
+    if LEADS_OUT.match(inside) or "\0" in inside:
         raise SceneError(f"{key} is {path!r:.80}, which leads out of the capture folder: copy it there")
     if key == "depth_path" and not (capture / inside).is_file():  # instant-ngp skips these
         return None
