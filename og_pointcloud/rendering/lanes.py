@@ -32,18 +32,12 @@ EXP2_TERMS = np.polynomial.Chebyshev.interpolate(np.exp2, 5, [-0.5, 0.5]).conver
 class Lanes(types.Type):
     """The numba type of WIDTH float32."""
 
-    def __init__(self) -> None:
-        super().__init__("Lanes")
-
 
 class Truths(types.Type):
     """The numba type of WIDTH booleans, the result of comparing Lanes."""
 
-    def __init__(self) -> None:
-        super().__init__("Truths")
 
-
-LANES, TRUTHS = Lanes(), Truths()
+LANES, TRUTHS = Lanes("Lanes"), Truths("Truths")
 
 
 def _register(kind: type[types.Type], vector: ir.VectorType) -> None:

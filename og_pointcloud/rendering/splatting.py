@@ -430,9 +430,7 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = ranges[i, 0], ranges[i, 1]
-                if end - begin > 2:  # for fewer, the box will do
-                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_alpha_min)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_alpha_min)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     # Second pass: the splats themselves, in order of depth as they come.
@@ -443,9 +441,7 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = ranges[i, 0], ranges[i, 1]
-                if end - begin > 2:
-                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_alpha_min)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_alpha_min)
                 for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = i
@@ -456,6 +452,8 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tiles_of_row(splats, place, row, begin, end, log2_alpha_min):  # noqa: ANN001, ANN202
     """The columns of tiles, of those that its box touches, that a splat's ellipse touches in a row of tiles."""
+    if end - begin <= 2:  # the box will do
+        return begin, end
     s = splats[place]
     # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
     # within the row of tiles where it comes nearest to that; its left end is the mirror image.

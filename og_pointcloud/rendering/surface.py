@@ -76,8 +76,8 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         around = neighborhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, settings, journal)
-        spacing, typical = around.spacing, float(np.median(around.spacing))
-        thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=not is_paper)
+        thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), settings.geometry)
+        thickness = _blended_thickness(gaussians, thickness) if is_paper else thickness
         # Only mode paper renders a view more than once.
         stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal) if is_paper else 1
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, not is_paper)
@@ -145,21 +145,12 @@ def sight_thickness(
     return (settings.sight_thickness * np.maximum(spacing, typical_spacing)).astype(np.float32)
 
 
-def surface_thickness(
-    gaussians: Gaussians, spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings, *,
-    by_sight: bool,
-) -> NDArray[np.float32]:  # fmt: skip
-    """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick.
-
-    by_sight: for points that are looked up along their own rays (`sight_thickness`).
-    """
-    if by_sight:
-        return sight_thickness(spacing, typical_spacing, settings)
+def _blended_thickness(gaussians: Gaussians, thickness: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n,) how far behind the front of its surface a blended Gaussian may lie. thickness: (n,) `sight_thickness`."""
     # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
     # hence twice the thickness; and a splat reaches three standard deviations beyond its center.
     with np.errstate(over="ignore"):  # a splat near float32's largest is infinitely thick
-        thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
-    return thickness.astype(np.float32)
+        return 2 * thickness + 3 * gaussians.scale.max(axis=1)
 
 
 def stride_for_pixels(views: Sequence[View], max_pixels: int, journal: Journal) -> int:
