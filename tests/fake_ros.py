@@ -248,6 +248,7 @@ def install(monkeypatch):
     }
     for name, stand_in in modules.items():
         monkeypatch.setitem(sys.modules, name, stand_in)
-    for name in ("node", "map_node"):
-        monkeypatch.delitem(sys.modules, f"og_pointcloud_ros.{name}", raising=False)
+    for name in ("og_pointcloud_ros.node", "og_pointcloud_ros.map_node"):  # they hold the stand-ins
+        monkeypatch.setitem(sys.modules, name, None)  # so that what the test imports is gone again after it
+        del sys.modules[name]
     return rclpy

@@ -59,14 +59,21 @@ def test_a_bag_becomes_a_map(tmp_path, capsys):
     assert not out.with_name("room.ogpc.map").exists()
 
 
-def test_an_interrupted_map_is_resumed(tmp_path, capsys):
-    given = frames(THINGS)
-    bag, out, work = write_bag(tmp_path / "drive", given), tmp_path / "room.ogpc", tmp_path / "room.ogpc.map"
-    begun = og.Mapper(feature_space=SPACE, journal=work)
-    for frame in list(BagFrames(bag))[:6]:
-        begun.integrate(frame)
-    del begun
-    arguments = ["map", str(bag), "-o", str(out), "--feature-space", SPACE]
+def test_an_interrupted_map_is_resumed(tmp_path, capsys, monkeypatch):
+    integrate, mappers = og.Mapper.integrate, []
+
+    def interrupted(mapper, frame):
+        mappers.append(mapper)
+        if len(mappers) == 7:
+            raise KeyboardInterrupt
+        return integrate(mapper, frame)
+
+    bag = write_bag(tmp_path / "drive", frames(THINGS))
+    arguments = ["map", str(bag), "-o", str(tmp_path / "room.ogpc"), "--feature-space", SPACE]
+    with monkeypatch.context() as patch:
+        patch.setattr(og.Mapper, "integrate", interrupted)
+        assert main(arguments) == 130
+    assert not (tmp_path / "room.ogpc.map" / ".lock").exists(), "other processes are still kept out"
     assert main(arguments) == 2
     assert "add --resume" in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from labelled_clouds import room
+from scenes import write_ply
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -206,20 +207,23 @@ def bad_frames():
     }
 
 
-@pytest.mark.parametrize("said", bad_frames())
-def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said):
+BAD_FRAMES = bad_frames()
+
+
+@pytest.mark.parametrize(("said", "frame"), BAD_FRAMES.items(), ids=BAD_FRAMES)
+def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said, frame):
     mapper, _ = grown
-    before, sequence = mapper.snapshot(), mapper.points
+    before, points = mapper.snapshot(), mapper.points
     with pytest.raises((SceneError, FeatureSpaceError), match=said):
-        mapper.integrate(bad_frames()[said])
+        mapper.integrate(frame)
     assert mapper.snapshot() is before
-    assert mapper.points == sequence
+    assert mapper.points == points
 
 
 @pytest.mark.parametrize("said", ["has no camera", "its camera is a ndarray", "a frame is a str; expected an og.Frame"])
 def test_a_bad_first_frame_is_refused_in_the_same_words(said):
     with pytest.raises(SceneError, match=said):
-        og.Mapper().integrate(bad_frames()[said])
+        og.Mapper().integrate(BAD_FRAMES[said])
 
 
 def test_a_map_takes_over_the_encoder_that_a_frame_names():
@@ -263,6 +267,15 @@ def test_rows_of_a_cloud_that_lie_nowhere_are_left_out():
     assert said[0].filename == __file__
     with pytest.warns(UserWarning, match="1 of 1 points"), pytest.raises(SceneError, match="the cloud has 0 points"):
         og.Mapper(cloud=cloud[1:2])
+
+
+def test_a_file_is_known_with_its_colors(tmp_path):
+    colors = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90]], np.uint8)
+    write_ply(tmp_path / "cloud.ply", np.array([[0, 0, 1], [np.nan, 0, 1], [0, 1, 1]]), colors)
+    with pytest.warns(UserWarning, match="1 of 3 points contain NaN or infinity .*: left out") as said:
+        known = og.Mapper(cloud=tmp_path / "cloud.ply")._map
+    assert len(said) == 1
+    assert sorted(known.points.rgb.tolist()) == colors[::2].tolist()
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -502,17 +515,6 @@ def test_the_point_size_that_a_snapshot_chose_is_in_the_journal(tmp_path):
         np.testing.assert_array_equal(one.openness, other.openness)
 
 
-def test_a_closed_mapper_leaves_its_journal_to_others(tmp_path):
-    first, second = frames(THINGS)[:2]
-    with og.Mapper(feature_space=SPACE, journal=tmp_path) as mapper:
-        mapper.integrate(first)
-    code = f"import og_pointcloud as og; og.Mapper(feature_space={SPACE!r}, journal={str(tmp_path)!r})"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-    with pytest.raises(OgPointcloudError, match="was closed, or another mapper now writes to it"):
-        mapper.integrate(second)
-    assert not mapper.holds(second.stamp)
-
-
 def test_a_journal_that_cannot_be_written_is_one_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OgPointcloudError, match=r"file' cannot be used \(File exists\)"):
@@ -562,17 +564,23 @@ def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
 
 
 def test_a_journal_is_one_mappers(tmp_path):
-    """Another process is kept out; in one process, as in a notebook, the mapper made last has it."""
+    """Another process is kept out; in one process, as in a notebook, the mapper made last has it until it is closed."""
     given = frames(THINGS)[:2]
     first, _ = mapped(given[:1], journal=tmp_path)
     code = f"import og_pointcloud as og; og.Mapper(feature_space={SPACE!r}, journal={str(tmp_path)!r})"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert f"is in use by process {os.getpid()}" in other.stderr
-    second, _ = mapped(given[1:], journal=tmp_path)
-    with pytest.raises(OgPointcloudError, match="another mapper now writes to"):
-        first.integrate(given[1])
-    del first, second
+    with mapped(given[1:], journal=tmp_path)[0] as second:
+        pass
+    for mapper in (first, second):
+        with pytest.raises(OgPointcloudError, match="was closed, or another mapper now writes to it"):
+            mapper.integrate(replace(given[1], stamp=9.0))
+        assert not mapper.holds(9.0)
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    third, _ = mapped(given[1:], journal=tmp_path)
+    assert (tmp_path / ".lock").exists()
+    del third
+    assert not (tmp_path / ".lock").exists(), "a mapper that is forgotten still keeps others out"
 
 
 def test_a_disk_that_was_full_for_a_while_costs_only_the_frames_of_then(tmp_path):

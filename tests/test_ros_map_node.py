@@ -1,7 +1,6 @@
 """The node that maps, on stand-ins for rclpy and tf2 (``fake_ros``): it was never run on ROS here."""
 
 import importlib
-import sys
 
 import numpy as np
 import pytest
@@ -22,9 +21,7 @@ BEFORE, AFTER = [CHEST, BIN, CRATE], [CHEST, BIN, moved(CRATE, (-0.9, 0.5, 0.0))
 def module(monkeypatch):
     fake_ros.install(monkeypatch)
     fake_ros.Node.overrides.update(feature_space=SPACE, max_age=60.0)
-    yield importlib.import_module("og_pointcloud_ros.map_node")
-    for name in ("node", "map_node"):
-        sys.modules.pop(f"og_pointcloud_ros.{name}", None)  # they hold the stand-ins
+    return importlib.import_module("og_pointcloud_ros.map_node")
 
 
 def send(node, given, *, placed=True, without=()):
@@ -79,6 +76,11 @@ def test_the_map_is_saved_reset_and_loaded(module, tmp_path):
     assert node.services["~/save"]().success
     assert node.services["~/reset"]().success
     assert objects(node) == {}
+    node.parameters["feature_space"] = "another/encoder"
+    answer = node.services["~/load"]()
+    assert not answer.success
+    assert "'another/encoder'" in answer.message
+    node.parameters["feature_space"] = SPACE
     assert node.services["~/load"]().success
     assert objects(node) == dict.fromkeys(known, "unseen")
     send(node, frames(BEFORE, seed=2, first=200.0))

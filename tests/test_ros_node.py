@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -26,9 +25,7 @@ WORDS = ["apple", "pear", "plum"]
 def rclpy(monkeypatch, scene):
     stand_in = fake_ros.install(monkeypatch)
     fake_ros.Node.overrides.update(scene=str(scene.path), labels=WORDS, minimum_points=1)
-    yield stand_in
-    for name in ("node", "map_node"):
-        sys.modules.pop(f"og_pointcloud_ros.{name}", None)  # it holds the stand-ins
+    return stand_in
 
 
 @pytest.fixture

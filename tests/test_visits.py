@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from labelled_clouds import instance_table, make_cloud
+from scenes import HEIGHT, WIDTH, write_depth
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -429,8 +430,18 @@ def test_another_encoder_is_refused(monday):
     other = replace(scene(AFTER), feature_space="another-space")
     with pytest.raises(FeatureSpaceError, match=f"expected feature space '{SPACE}'"):
         og.update(monday, other, progress=False)
-    with pytest.raises(SceneError, match="capture is a str; expected a Scene"):
-        og.update(monday, "capture", progress=False)
+    with pytest.raises(SceneError, match="capture is a list; expected a folder, or a Scene"):
+        og.update(monday, [], progress=False)
+
+
+def test_a_folder_is_read_with_its_depth_images(tiny_capture):
+    before = og.fit(og.read_capture(tiny_capture.folder), progress=False)
+    same = og.update(before, str(tiny_capture.folder), progress=False)
+    assert str(same.changes) == "0 gone, 0 new, 0 moved, 0 not seen again"
+    for k in range(6):  # a wall before each camera
+        write_depth(tiny_capture.folder / "depth" / f"view{k}.png", np.full((HEIGHT, WIDTH), 0.5))
+    with pytest.raises(SceneError, match="0 are where they were"):
+        og.update(before, tiny_capture.folder, progress=False)
 
 
 def test_a_map_without_points_is_refused(monday):

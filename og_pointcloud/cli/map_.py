@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -38,27 +39,29 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--work is '{work}', which has other files than a map; expected a new folder name")
     if work.exists() and not arguments.resume:
         raise OgPointcloudError(f"'{work}' contains an interrupted map: add --resume, or remove it")
-    frames = BagFrames(arguments.bag, arguments.frame)
-    mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
-    refused, taken = {}, 0
-    for frame in tqdm(frames, desc="frames", disable=None, leave=False):
-        if arguments.resume and frame.stamp is not None and mapper.holds(frame.stamp):
-            continue
-        try:
-            mapper.integrate(frame)
-            taken += 1
-        except OgPointcloudError as error:
-            refused[str(error)] = refused.get(str(error), 0) + 1
-    left_out = [*frames.dropped.items(), *refused.items()]
-    for why, count in left_out[:SHOWN]:
-        print(f"left out: {count} x {why}", file=sys.stderr)
-    if rest := left_out[SHOWN:]:
-        print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)
-    if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
-        shutil.rmtree(work)
-    mapper.save(arguments.output)
+    frames, refused, taken = BagFrames(arguments.bag, arguments.frame), Counter[str](), 0
+    with Mapper(arguments.start, feature_space=arguments.feature_space, journal=work) as mapper:
+        for frame in tqdm(frames, desc="frames", disable=None, leave=False):
+            if arguments.resume and frame.stamp is not None and mapper.holds(frame.stamp):
+                continue
+            try:
+                mapper.integrate(frame)
+                taken += 1
+            except OgPointcloudError as error:
+                refused[str(error)] += 1
+        print_left_out([*frames.dropped.items(), *refused.items()])
+        if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
+            shutil.rmtree(work)
+        mapper.save(arguments.output)
     shutil.rmtree(work)
     made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
     print(", ".join(counted(count, thing) for count, thing in made))
     print(f"wrote {arguments.output}")
     print_next("info", arguments.output)
+
+
+def print_left_out(reasons: list[tuple[str, int]]) -> None:
+    for why, count in reasons[:SHOWN]:
+        print(f"left out: {count} x {why}", file=sys.stderr)
+    if rest := reasons[SHOWN:]:
+        print(f"left out: {sum(count for _, count in rest)} more, for {len(rest)} other reasons", file=sys.stderr)

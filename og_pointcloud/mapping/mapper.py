@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.points import read_points
 from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
 from og_pointcloud.mapping.frame import COMPARED_POINTS, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points, measured_points, vote
@@ -116,11 +117,10 @@ class Mapper:
             self._space = replace(self._base.space, name=named)
             self._continue(self._base)
         elif cloud is not None:
-            points = cloud if isinstance(cloud, Points) else Points.from_world(_placed(world_points(cloud)))
-            self._start_from(points, self._space, None, grows=False)
+            self._start_from(_known_points(cloud), grows=False)
         self._journal = None if journal is None else self._resumed(MapJournal(journal, self._began_with))
 
-    def _start_from(self, points: Points, space: FeatureSpace, spacing: float | None, *, grows: bool) -> GrowingMap:
+    def _start_from(self, points: Points, spacing: float | None = None, *, grows: bool) -> GrowingMap:
         """Start with known points. spacing None: their own."""
         if not len(points):
             raise SceneError("the map has 0 points; expected at least one: leave out start and cloud to begin empty")
@@ -128,7 +128,7 @@ class Mapper:
         self._neighborhood = neighborhood(points.xyz, self.settings.geometry)
         spacing = float(np.median(self._neighborhood.spacing)) if spacing is None else spacing
         scatter = DiscSurface(points.xyz, self._neighborhood).scatter if len(points) > 1 else 0.0
-        self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
+        self._map = GrowingMap.empty(points.origin, self._space, spacing, grows=grows, scatter=scatter)
         self._rows = self._map.points.add_known(points.xyz, points.rgb)
         self._map.spacing = self._neighborhood.spacing[np.argsort(self._rows)]
         self._map.grow()
@@ -136,7 +136,7 @@ class Mapper:
 
     def _continue(self, base: LabelledCloud) -> None:
         """Adopt a map's points and instances as they are."""
-        map_ = self._start_from(Points(base.xyz, base.origin, base.rgb), self._space, base.spacing, grows=True)
+        map_ = self._start_from(Points(base.xyz, base.origin, base.rgb), base.spacing, grows=True)
         record, table = MapRecord.of(base), base.instances
         map_.stamp = record.visits[-1].stamp
         for k in range(len(table)):
@@ -322,12 +322,12 @@ class Mapper:
 
     def _label(self, map_: GrowingMap) -> LabelledCloud:
         """The points that are there, labelled by the batch rule, with the ids of the objects."""
-        chosen, around = map_.points.alive, self._neighborhood
+        there, around = map_.points.alive, self._neighborhood
         if self._base is not None:  # this visit consists of what its frames have looked at
-            chosen &= map_.presence.seen_at[: map_.points.n] > -np.inf
+            there &= map_.presence.seen_at[: map_.points.n] > -np.inf
         # Points given at the start, in their given order, then those that frames added.
         rows = np.concatenate([self._rows, np.arange(len(self._rows), map_.points.n)])
-        rows = rows[chosen[rows]]
+        rows = rows[there[rows]]
         if around is None or not np.array_equal(rows, self._rows):  # the same number may be other points
             around = neighborhood(map_.points.xyz[rows], self.settings.geometry)
         count, wanted = map_.tracks.next_id, np.zeros(0, np.int64)
@@ -354,10 +354,15 @@ class Mapper:
         return updated.cloud
 
 
-def _placed(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rows (n, 3) that are finite, as `read_points` keeps of a file."""
+def _known_points(cloud: Any) -> Points:
+    """A cloud as `Mapper` takes it, without the rows that contain NaN or infinity."""
+    if isinstance(cloud, Points):
+        return cloud
+    if isinstance(cloud, (str, os.PathLike)):
+        return read_points(cloud)
+    xyz = world_points(cloud)
     placed = np.isfinite(xyz).all(axis=1)
     if not placed.all():
         what = f"{np.count_nonzero(~placed)} of {len(xyz)} points contain NaN or infinity: the map leaves them out"
         warnings.warn(what, stacklevel=3)
-    return xyz[placed]
+    return Points.from_world(xyz[placed])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,12 @@ from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.colors import UNKNOWN_COLOR
 from og_pointcloud.mapping.changes import SAME_SURFACE_SPACINGS, Changes, Comparison, compare_visits
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
 from og_pointcloud.mapping.presence import MAJORITY, MIN_POINTS, Visit
-from og_pointcloud.mapping.sight import MeasuredView
+from og_pointcloud.mapping.sight import MeasuredView, depth_views
 from og_pointcloud.rendering.geometry import nearest_in
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -45,7 +47,7 @@ class Updated:
 
 def update(
     before: SceneLike,
-    capture: Scene,
+    capture: Scene | str | Path,
     *,
     depth: Iterable[MeasuredView] | None = None,
     settings: FitSettings | None = None,
@@ -53,16 +55,20 @@ def update(
 ) -> Updated:
     """Merge a later capture of the same place, or of a part of it, into a map.
 
-    capture: in the map's world frame, with points of its own. depth: what its views measured, in the map's local frame
-    (`sight.view_of_depth`); None: its points take the place of depth. FeatureSpaceError for masks of another encoder,
-    SceneError for a capture that does not lie where the map does. The given map is not changed: the new one is a copy.
+    capture: a folder, or a scene, in the map's world frame, with points of its own. depth: what its views measured, in
+    the map's local frame (`sight.depth_views`); None: the folder's depth images, if there are any, else its points take
+    the place of depth. FeatureSpaceError for masks of another encoder, SceneError for a capture that does not lie where
+    the map does. The given map is not changed: the new one is a copy.
 
     >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
     """
-    if not isinstance(capture, Scene):
-        raise SceneError(f"capture is a {type(capture).__name__}; expected a Scene, as og.read_capture(FOLDER) returns")
     cloud = as_scene(before).cloud
+    if isinstance(capture, (str, Path)):
+        depth = depth_views(capture, cloud.origin) if depth is None else depth
+        capture = read_capture(capture)
+    if not isinstance(capture, Scene):
+        raise SceneError(f"capture is a {type(capture).__name__}; expected a folder, or a Scene that was read from one")
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
     visit = fit(capture, settings, progress=progress)
     earlier, later = Visit(cloud), Visit.in_frame_of(cloud, visit, depth)

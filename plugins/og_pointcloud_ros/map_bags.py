@@ -10,6 +10,7 @@ rectified where depth or masks have "rect" in their topic's name. Messages of on
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
@@ -17,11 +18,11 @@ from posixpath import commonpath
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.frame import Frame
-from og_pointcloud_ros.bags import Reader, decoded, messages_of, open_bag, ros2_types, transforms_of
+from og_pointcloud_ros.bags import CLOUD, Reader, decoded, messages_of, open_bag, ros2_types, transforms_of
 from og_pointcloud_ros.frames import REQUIRED_ROLES, FrameAssembler
 from og_pointcloud_ros.transforms import TransformTree
 
-IMAGE, INFO, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
+IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 MAX_PENDING_STAMPS = 100
 """Number of stamps that wait for their other messages; masks come seconds after their image."""
 
@@ -33,7 +34,7 @@ class BagFrames:
     """
 
     def __init__(self, source: str | os.PathLike[str], frame: str = "map") -> None:
-        self.source, self.frame, self.dropped = source, frame, dict[str, int]()
+        self.source, self.frame, self.dropped = source, frame, Counter[str]()
         with open_bag(source) as reader:
             topics = _topics_by_role([(c.topic, c.msgtype) for c in reader.connections], str(source))
             if len(infos := topics["info"]) > 1:
@@ -51,7 +52,7 @@ class BagFrames:
                 try:
                     assembler.add(role, decoded(store, data, connection.msgtype))
                 except (OgPointcloudError, ValueError) as error:
-                    self._drop(f"{role}: {error}")
+                    self.dropped[f"{role}: {error}"] += 1
                 # Complete frames; else the oldest of too many waiting ones, with the messages that have arrived.
                 ready = [*filter(assembler.is_complete, assembler.waiting)]
                 for stamp in ready or sorted(assembler.waiting)[:-MAX_PENDING_STAMPS]:
@@ -65,11 +66,8 @@ class BagFrames:
             if (frame := assembler.frame(stamp, partial(tree.lookup, self.frame))) is not None:
                 yield frame
         except OgPointcloudError as error:
-            self._drop(str(error))
+            self.dropped[str(error)] += 1
         assembler.forget(stamp)
-
-    def _drop(self, why: str) -> None:
-        self.dropped[why] = self.dropped.get(why, 0) + 1
 
 
 def _topics_by_role(topics: list[tuple[str, str]], source: str) -> dict[str, list[str]]:

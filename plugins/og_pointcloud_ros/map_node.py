@@ -16,9 +16,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.qos import QoSReliabilityPolicy  # pyright: ignore[reportMissingImports]
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # pyright: ignore[reportMissingImports]
 from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
@@ -48,15 +49,15 @@ class MapNode(PlacedNode):
         self._assembler, self._arrived = FrameAssembler(rectified=self._value("rectified")), dict[int, float]()
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._objects = self.create_publisher(Detection3DArray, "~/objects", latest_only(reliable, latched=True))
-        self._queue = FrameQueue(self._empty(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
+        self._queue = FrameQueue(self._mapper(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
         for role, kind in INPUTS.items():
             take = partial(self._on_message, role)
             self.create_subscription(kind, f"~/input/{role}", take, latest_only(best_effort, depth=QUEUE_DEPTH))
         for name, serve in {"save": self._save, "load": self._load, "reset": self._reset}.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
 
-    def _empty(self) -> Mapper:
-        return Mapper(feature_space=self._value("feature_space"))
+    def _mapper(self, start: str | None = None) -> Mapper:
+        return Mapper(start, feature_space=self._value("feature_space"))
 
     def _on_message(self, role: str, message: Any) -> None:
         try:
@@ -74,7 +75,7 @@ class MapNode(PlacedNode):
             if not is_old and not self._assembler.is_complete(stamp):
                 continue
             try:
-                if (frame := self._assembler.frame(stamp, self._pose)) is not None:
+                if (frame := self._assembler.frame(stamp, self._pose_at)) is not None:
                     self._queue.put(frame)
             except TransformException as error:
                 if not is_old:  # tf is often a little later: retried
@@ -84,9 +85,8 @@ class MapNode(PlacedNode):
                 self._warn(f"a frame was dropped: {error_text(error)}")
             self._assembler.forget(stamp)
 
-    def _pose(self, frame_id: str, stamp: int) -> Any:
-        head = SimpleNamespace(frame_id=frame_id, stamp=time_message(ros_messages, stamp))
-        return self._pose_at(head)
+    def _pose_at(self, frame_id: str, stamp: int) -> NDArray[np.float64]:
+        return self._pose(frame_id, time_message(ros_messages, stamp))
 
     def _on_change(self, change: FrameChange) -> None:
         for text, ids in (("gone", change.gone), ("moved", [moved.id for moved in change.moved])):
@@ -113,12 +113,12 @@ class MapNode(PlacedNode):
         return f"wrote {self._queue.mapper.save(self._path())}"
 
     def _load(self) -> str:
-        self._queue.mapper = Mapper(self._path())
+        self._queue.mapper = self._mapper(self._path())
         self._publish()
         return f"{self._queue.mapper.points:,} points, {len(self._queue.mapper.objects())} objects"
 
     def _reset(self) -> str:
-        self._queue.mapper = self._empty()
+        self._queue.mapper = self._mapper()
         self._publish()
         return "the map is empty"
 

@@ -72,9 +72,9 @@ class PlacedNode(Node):
         """Retry what is waiting; called every RETRY_S seconds."""
         raise NotImplementedError
 
-    def _pose_at(self, head: Any) -> NDArray[np.float64]:
-        """(4, 4) from a header's frame to the target frame at its time; tf2's TransformException if unknown."""
-        found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
+    def _pose(self, frame_id: str, stamp: Any) -> NDArray[np.float64]:
+        """(4, 4) from a frame to the target frame. stamp: a Time message. tf2's TransformException if unknown."""
+        found = self._transforms.lookup_transform(self._target_frame, frame_id, Time.from_msg(stamp))
         translation, rotation = found.transform.translation, found.transform.rotation
         return pose_of((translation.x, translation.y, translation.z), (rotation.x, rotation.y, rotation.z, rotation.w))
 
@@ -151,7 +151,7 @@ class SegmentNode(PlacedNode):
         message, arrived = self._waiting
         self._waiting = None
         try:
-            labelled = self._labeller(message, self._pose_at(message.header))
+            labelled = self._labeller(message, self._pose(message.header.frame_id, message.header.stamp))
         except TransformException as error:
             if time.monotonic() - arrived <= self._max_age:
                 self._waiting = message, arrived
