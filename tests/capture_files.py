@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
 from dataclasses import dataclass, field
@@ -126,6 +127,12 @@ def write_transforms(folder: Path, world: World, per_frame=False, suffix=".png",
     (folder / name).write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
 
 
+def _colmap_images(world: World, cameras, poses):
+    """(name, pose, camera id) of each image; the cameras take turns."""
+    rows = np.hstack([world.quaternions, world.translations]) if poses is None else poses
+    return zip(world.names, rows, itertools.cycle(cameras), strict=False)
+
+
 def write_colmap_text(model: Path, world: World, cameras=None, poses=None):
     """cameras: lines of cameras.txt by camera id; poses: (qw qx qy qz tx ty tz) per image, else the world's."""
     model.mkdir(parents=True, exist_ok=True)
@@ -135,11 +142,8 @@ def write_colmap_text(model: Path, world: World, cameras=None, poses=None):
         for camera_id, (name, values) in cameras.items()
     ]
     (model / "cameras.txt").write_text("# Camera list\n" + "\n".join(lines) + "\n")
-    rows = np.hstack([world.quaternions, world.translations]) if poses is None else poses
-    camera_ids = list(cameras)
     text = "# Image list\n# Number of images\n"
-    for index, (name, row) in enumerate(zip(world.names, rows, strict=True)):
-        camera_id = camera_ids[index % len(camera_ids)]
+    for index, (name, row, camera_id) in enumerate(_colmap_images(world, cameras, poses)):
         text += f"{index + 1} " + " ".join(f"{float(v)!r}" for v in row) + f" {camera_id} {name}.png\n"
         text += "1.5 2.5 -1 3.5 4.5 7\n" if index % 2 else "\n"
     (model / "images.txt").write_text(text)
@@ -158,13 +162,9 @@ def write_colmap_binary(model: Path, world: World, cameras=None, poses=None):
         data += struct.pack("<IiQQ", camera_id, CAMERA_MODEL_IDS[name], WIDTH, HEIGHT)
         data += struct.pack(f"<{len(values)}d", *values)
     (model / "cameras.bin").write_bytes(data)
-    rows = np.hstack([world.quaternions, world.translations]) if poses is None else poses
-    camera_ids = list(cameras)
     data = struct.pack("<Q", len(world.names))
-    for index, (name, row) in enumerate(zip(world.names, rows, strict=True)):
-        data += (
-            struct.pack("<I7dI", index + 1, *row, camera_ids[index % len(camera_ids)]) + f"{name}.png".encode() + b"\0"
-        )
+    for index, (name, row, camera_id) in enumerate(_colmap_images(world, cameras, poses)):
+        data += struct.pack("<I7dI", index + 1, *row, camera_id) + f"{name}.png".encode() + b"\0"
         data += struct.pack("<Q", index) + struct.pack("<ddq", 1.5, 2.5, -1) * index
     (model / "images.bin").write_bytes(data)
     data = struct.pack("<Q", len(world.xyz))

@@ -534,12 +534,9 @@ def test_real_captures(name, views):
 def color_correlation(points, view):
     """Correlation of the brightness of visible points with that of their pixels."""
     camera, image = view.camera, view.image_rgb()
-    local = points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    ahead = local[:, 2] > 1e-3
-    depth, gray = local[ahead, 2], points.rgb[ahead].mean(1)
-    pixel = np.floor(local[ahead, :2] / depth[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).astype(int)
-    inside = ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(1)
-    (j, i), depth, gray = pixel[inside].T, depth[inside], gray[inside]
+    uv_px, depth = camera.project(points.xyz)
+    inside = camera.shows(uv_px)
+    (j, i), depth, gray = uv_px[inside].astype(int).T, depth[inside], points.rgb[inside].mean(1)
     cell = i // 8 * camera.width + j // 8
     nearest = np.full(cell.max() + 1, np.inf)
     np.minimum.at(nearest, cell, depth)

@@ -1,12 +1,14 @@
 """Depth files as they are stored, the cloud that fusion makes of them, and what is said of those that do not fit."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, room_poses, write_depth, write_frames
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
+from og_pointcloud.formats.depth import DepthFile, DepthImage, resampled
 from og_pointcloud.formats.fusion import (
     MAX_SLOPE,
     NOISE_TOLERANCE,
@@ -225,9 +227,8 @@ def test_order_of_frames_and_meters_or_millimeters_do_not_matter(tmp_path):
     def in_millimeters(frame):
         pose = frame.depth.camera.world_to_camera.copy()
         pose[:3, 3] *= 1000
-        lens = frame.depth.camera
-        moved = camera(np.linalg.inv(pose), (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy))
-        return DepthFrame(frame.name, DepthFile(frame.depth.path, moved, 1.0), frame.colors)
+        moved = replace(frame.depth.camera, world_to_camera=pose)
+        return replace(frame, depth=replace(frame.depth, camera=moved, unit=1.0))
 
     large = fuse([in_millimeters(frame) for frame in frames])
     assert large.survey.voxel == pytest.approx(1000 * fused.survey.voxel, rel=1e-4)
@@ -246,7 +247,7 @@ def test_a_view_far_away_is_named(tmp_path):
     frames = write_frames(tmp_path, 3)
     pose = room_poses(3)[1].copy()
     pose[0, 3] = 1e7
-    frames[1] = DepthFrame("lost", DepthFile(frames[1].depth.path, camera(pose), 1e-3), frames[1].colors)
+    frames[1] = replace(frames[1], name="lost", depth=replace(frames[1].depth, camera=camera(pose)))
     with pytest.raises(SceneError, match="view 'lost' has points 1e\\+07 from the middle"):
         fuse(frames)
 
@@ -329,12 +330,8 @@ def test_depth_that_fits_raises_no_doubt(tmp_path):
 
 
 def test_a_wrong_unit_is_named(tmp_path):
-    frames = [
-        DepthFrame(frame.name, DepthFile(frame.depth.path, frame.depth.camera, 1.0), frame.colors)
-        for frame in write_frames(tmp_path)
-    ]
-    said = doubtful_depth(frames)
-    assert "multiplied by 0.001" in said
+    frames = [replace(frame, depth=replace(frame.depth, unit=1.0)) for frame in write_frames(tmp_path)]
+    assert "multiplied by 0.001" in doubtful_depth(frames)
 
 
 def test_survey_of_exact_depth_knows_the_pixel(tmp_path):

@@ -19,6 +19,7 @@ pye57 = pytest.importorskip("pye57")
 
 TURN = np.array([0.8, 0.1, -0.2, 0.55]) / np.linalg.norm([0.8, 0.1, -0.2, 0.55])
 AT = np.array([10.0, -20.0, 3.0])
+STRAIGHT = np.array([1.0, 0, 0, 0])
 
 
 def scan(seed=0, count=300):
@@ -27,14 +28,15 @@ def scan(seed=0, count=300):
     return dict(zip(("cartesianX", "cartesianY", "cartesianZ"), rng.normal(size=(3, count)), strict=True)) | colors
 
 
-def write_e57(path, scans=1, images=()):
-    """scans: each at a pose of its own. images: (name, kind, numbers, encoded picture, pose or None)."""
+def write_e57(path, scans=1, images=(), turn=TURN, at=AT):
+    """scans: how many, or their data; each at a pose of its own. images: (name, kind, numbers, encoded picture, pose or
+    None)."""
     from pye57 import libe57
 
-    written = [scan(seed) for seed in range(scans)]
+    written = [scan(seed) for seed in range(scans)] if isinstance(scans, int) else scans
     with pye57.E57(str(path), mode="w") as file:
         for index, data in enumerate(written):
-            file.write_scan_raw(data, rotation=TURN, translation=AT + index)
+            file.write_scan_raw(data, rotation=turn, translation=at + index)
         handle = file.image_file
         vector = file.root["images2D"]
 
@@ -87,8 +89,7 @@ def test_scans_are_one_cloud_in_the_files_world(tmp_path):
 def test_points_that_the_scanner_calls_invalid_are_left_out(tmp_path):
     data = scan()
     data["cartesianInvalidState"] = (np.arange(300) % 3 == 0).astype(np.uint8)
-    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
-        file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=np.zeros(3))
+    write_e57(tmp_path / "a.e57", [data], turn=STRAIGHT, at=np.zeros(3))
     points = read_points(tmp_path / "a.e57")
     np.testing.assert_allclose(points.xyz_world[:, 0], data["cartesianX"][np.arange(300) % 3 != 0], atol=1e-6)
 
@@ -106,9 +107,8 @@ class Measured(np.ndarray):
 def test_points_with_nan_are_left_out_with_a_warning_and_stay_unknown_where_labelled(tmp_path):
     data = scan()
     data["cartesianX"][7] = np.nan
-    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
-        measured = {name: values.view(Measured) for name, values in data.items()}
-        file.write_scan_raw(measured, rotation=np.array([1.0, 0, 0, 0]), translation=np.zeros(3))
+    measured = {name: values.view(Measured) for name, values in data.items()}
+    write_e57(tmp_path / "a.e57", [measured], turn=STRAIGHT, at=np.zeros(3))
     with pytest.warns(UserWarning, match=r"1 of 300 points contain NaN or infinity \(the first is row 7\): left out"):
         points = read_points(tmp_path / "a.e57")
     np.testing.assert_allclose(points.xyz_world[:, 0], np.delete(data["cartesianX"], 7), atol=1e-6)

@@ -5,10 +5,12 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.faces import faces
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera, widest
+from og_pointcloud.formats.poses import rigid
 from og_pointcloud.scene import NOT_SEEN, Camera, View
 
 WIDTH, HEIGHT = 320, 240
@@ -216,12 +218,8 @@ FISHEYE = Camera(400, 400, 127.0, 127.0, 200.0, 200.0, np.eye(4))
 """Equidistant: its circle of 90 degrees has radius 199.5, its corners look backwards."""
 
 
-def pose(seed=3):
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    matrix[:3, :3] *= np.sign(np.linalg.det(matrix[:3, :3]))
-    matrix[:3, 3] = 0.3, -0.2, 0.9
-    return matrix
+def pose():
+    return rigid(Rotation.random(rng=np.random.default_rng(3)).as_matrix(), np.array([0.3, -0.2, 0.9]))
 
 
 def wide_images():
