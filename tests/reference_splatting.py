@@ -7,13 +7,21 @@ its inverse are taken in extended precision where the machine has it, so that th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import Camera
 
 Wide = np.longdouble
+
+
+def round_splats(xyz: ArrayLike, scale: ArrayLike, opacity: ArrayLike = 0.9) -> Gaussians:
+    """Splats alike in all directions. xyz: (n, 3). scale, opacity: a number, or (n,)."""
+    n = len(np.asarray(xyz))
+    size, rotation = np.broadcast_to(np.reshape(scale, (-1, 1)), (n, 3)), np.tile(np.float32([1, 0, 0, 0]), (n, 1))
+    opacities = np.broadcast_to(np.asarray(opacity, np.float32), n).copy()
+    return Gaussians(np.asarray(xyz, np.float32), size.astype(np.float32), rotation, opacities)
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:

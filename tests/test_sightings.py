@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import in_camera, reference_alpha
+from reference_splatting import in_camera, reference_alpha, round_splats
 
 from og_pointcloud.rendering.sightings import (
     EDGE_PX,
@@ -23,14 +23,6 @@ from og_pointcloud.scene import NOT_SEEN, Camera
 
 CAMERA = Camera(48, 40, 60, 60, 24, 20, np.eye(4))
 NEAR = 0.1
-
-
-def gaussians(xyz: NDArray[np.floating], scale: float | NDArray[np.floating], opacity: float = 0.9) -> Gaussians:
-    n = len(xyz)
-    rotation = np.zeros((n, 4), np.float32)
-    rotation[:, 0] = 1
-    size = np.broadcast_to(np.reshape(scale, (-1, 1)), (n, 3)).astype(np.float32)
-    return Gaussians(np.asarray(xyz, np.float32), size, rotation, np.full(n, opacity, np.float32))
 
 
 def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -57,7 +49,7 @@ def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.
 def test_openness_is_that_of_the_definition(seed: int) -> None:
     random = np.random.default_rng(seed)
     xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (150, 3))
-    splats = gaussians(xyz, random.uniform(0.01, 0.15, 150), random.uniform(0.3, 0.95))
+    splats = round_splats(xyz, random.uniform(0.01, 0.15, 150), random.uniform(0.3, 0.95))
     thickness = random.uniform(0, 0.3, 150).astype(np.float32)
     found, u, v = openness(splats, CAMERA, NEAR, thickness)
     expected = reference_openness(splats, CAMERA, thickness)
@@ -73,7 +65,7 @@ def test_more_splats_than_a_tile_fetches_at_once(scale: float, opacity: float) -
     """Faint ones leave light for some of those that are fetched next, opaque ones for none."""
     depth = np.random.default_rng(0).uniform(0.5, 5, 3 * BATCH)
     slopes = np.random.default_rng(1).uniform(-0.13, 0.13, (2, len(depth)))
-    splats = gaussians(np.stack([*(slopes * depth), depth], axis=1), scale, opacity)
+    splats = round_splats(np.stack([*(slopes * depth), depth], axis=1), scale, opacity)
     thickness = np.full(len(depth), 0.1, np.float32)
     expected = reference_openness(splats, CAMERA, thickness)
     np.testing.assert_allclose(openness(splats, CAMERA, NEAR, thickness)[0], expected, atol=2e-5)
@@ -84,7 +76,7 @@ def test_more_splats_than_a_tile_fetches_at_once(scale: float, opacity: float) -
 def test_points_of_one_surface_do_not_hide_each_other() -> None:
     line = np.linspace(-0.3, 0.3, 12)
     x, y, z = np.meshgrid(line, line, [2.0, 2.05, 2.1])
-    layers = gaussians(np.stack([x, y, z], axis=-1).reshape(-1, 3), 0.05)
+    layers = round_splats(np.stack([x, y, z], axis=-1).reshape(-1, 3), 0.05)
     thick = openness(layers, CAMERA, NEAR, np.full(len(layers), 0.2, np.float32))[0]
     thin = openness(layers, CAMERA, NEAR, np.full(len(layers), 0.01, np.float32))[0]
     np.testing.assert_array_equal(thick, 1)
@@ -92,7 +84,7 @@ def test_points_of_one_surface_do_not_hide_each_other() -> None:
 
 
 def test_votes_go_to_the_masks_at_and_around_the_pixel() -> None:
-    splats = gaussians(np.array([[0.0, 0, 2], [0.52, 0, 2], [-2.5, 0, 2]]), 0.01)  # middle, on the edge, outside
+    splats = round_splats([[0, 0, 2], [0.52, 0, 2], [-2.5, 0, 2]], 0.01)  # middle, on the edge, outside
     ids = np.full((40, 48), -1, np.int32)
     ids[:, 24:39] = 0
     ids[:, 39:] = 1
@@ -110,11 +102,11 @@ def test_votes_go_to_the_masks_at_and_around_the_pixel() -> None:
 def test_order_of_points_and_who_is_asked_change_nothing() -> None:
     random = np.random.default_rng(1)
     xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (400, 3)).astype(np.float32)
-    splats, thickness = gaussians(xyz, 0.06), np.full(400, 0.1, np.float32)
+    splats, thickness = round_splats(xyz, 0.06), np.full(400, 0.1, np.float32)
     ids = random.integers(-1, 3, (40, 48)).astype(np.int32)
     rows = sightings(splats, CAMERA, ids, 3, NEAR, thickness).rows.toarray()
     order = random.permutation(400)
-    shuffled = sightings(gaussians(xyz[order], 0.06), CAMERA, ids, 3, NEAR, thickness).rows.toarray()
+    shuffled = sightings(round_splats(xyz[order], 0.06), CAMERA, ids, 3, NEAR, thickness).rows.toarray()
     np.testing.assert_array_equal(shuffled, rows[:, order])
     asked = random.random(400) < 0.3
     some = sightings(splats, CAMERA, ids, 3, NEAR, thickness, asked).rows.toarray()
@@ -126,20 +118,20 @@ def test_unit_of_length_changes_nothing() -> None:
     random = np.random.default_rng(2)
     xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (300, 3)).astype(np.float32)
     thickness = np.full(300, 0.1, np.float32)
-    found = openness(gaussians(xyz, 0.06), CAMERA, NEAR, thickness)[0]
+    found = openness(round_splats(xyz, 0.06), CAMERA, NEAR, thickness)[0]
     for unit in (2.0**10, 2.0**-10):
-        same = openness(gaussians(xyz * unit, 0.06 * unit), CAMERA, NEAR * unit, thickness * np.float32(unit))[0]
+        same = openness(round_splats(xyz * unit, 0.06 * unit), CAMERA, NEAR * unit, thickness * np.float32(unit))[0]
         np.testing.assert_allclose(same, found, atol=1e-6)
 
 
 def test_nothing_in_the_image_is_no_error() -> None:
     ids = np.zeros((40, 48), np.int32)
-    behind = gaussians(np.array([[0.0, 0, -2]]), 0.1)
-    for splats in (behind, gaussians(np.zeros((0, 3)), 0.1)):
+    behind = round_splats([[0, 0, -2]], 0.1)
+    for splats in (behind, round_splats(np.zeros((0, 3)), 0.1)):
         seen = sightings(splats, CAMERA, ids, 1, NEAR, np.ones(len(splats), np.float32))
         assert (seen.rows.shape, seen.rows.nnz, seen.openness.nnz) == ((2, len(splats)), 0, 0)
     other = replace(CAMERA, width=17, height=1)  # a tile and a bit, one row
-    one = sightings(gaussians(np.array([[0.0, -0.65, 2]]), 0.1), other, ids[:1, :17], 1, NEAR, np.ones(1, np.float32))
+    one = sightings(round_splats([[0, -0.65, 2]], 0.1), other, ids[:1, :17], 1, NEAR, np.ones(1, np.float32))
     assert one.rows.shape == (2, 1)
 
 

@@ -16,6 +16,7 @@ from reference_splatting import (
     reference_pixel_weights,
     reference_view_weights,
     rotation_matrix,
+    round_splats,
 )
 from scipy.sparse import csr_array
 
@@ -28,7 +29,9 @@ from og_pointcloud.scene import Camera, Points, View
 
 NEAR = 0.25
 MASKS = 12
-IDENTITY = np.array([1, 0, 0, 0], np.float32)
+DOT = round_splats([[0, 0, 1]], 0, 0.5)
+ONE_BEHIND_ANOTHER = round_splats([[0, 0, 1], [0, 0, 2]], [5, 0.2], [0.7, 0.9])
+TWENTY_IN_A_ROW = round_splats(np.linspace([0, 0, 1], [0, 0, 2], 20), 50)
 
 
 def camera(width: int = 50, height: int = 37, focal: float = 40.0, **changes: float | NDArray[np.float64]) -> Camera:
@@ -235,11 +238,7 @@ def test_nothing_in_view_gives_empty_rows(random: Generator) -> None:
 
 def test_one_splat_by_hand() -> None:
     """A point-like splat on a pixel center: covariance 0.3, so alpha falls with exp(-d^2 / 0.6)."""
-    view = camera(5, 5, 10.0, fy=10.0)
-    splat = Gaussians(
-        np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.float32), IDENTITY[None], np.float32([0.5])
-    )
-    image = pixel_weights(splat, view, NEAR).toarray().reshape(5, 5)
+    image = pixel_weights(DOT, camera(5, 5, 10.0, fy=10.0), NEAR).toarray().reshape(5, 5)
     np.testing.assert_allclose(image[2, 2], 0.5, rtol=1e-6)
     np.testing.assert_allclose(image[2, 3], 0.5 * np.exp(-1 / 0.6), rtol=1e-6)
     np.testing.assert_allclose(image[1, 1], 0.5 * np.exp(-2 / 0.6), rtol=1e-6)
@@ -247,34 +246,24 @@ def test_one_splat_by_hand() -> None:
 
 
 def test_of_coincident_splats_the_lower_index_is_in_front() -> None:
-    xyz = np.zeros((3, 3), np.float32) + np.array([0, 0, 2], np.float32)
-    three = Gaussians(xyz, np.full((3, 3), 10, np.float32), np.tile(IDENTITY, (3, 1)), np.full(3, 0.5, np.float32))
-    weights = pixel_weights(three, camera(3, 3), NEAR)[[4]].toarray().ravel()
+    weights = pixel_weights(round_splats([[0, 0, 2]] * 3, 10, 0.5), camera(3, 3), NEAR)[[4]].toarray().ravel()
     np.testing.assert_allclose(weights, [0.5, 0.25, 0.125], rtol=1e-3)
 
 
 def test_a_pixel_stops_before_its_transmittance_falls_below_the_limit() -> None:
-    depth = np.linspace(1, 2, 20)
-    xyz = np.stack([0 * depth, 0 * depth, depth], axis=1).astype(np.float32)
-    wall = Gaussians(xyz, np.full((20, 3), 50, np.float32), np.tile(IDENTITY, (20, 1)), np.full(20, 0.9, np.float32))
-    weights = pixel_weights(wall, camera(1, 1), NEAR).toarray().ravel()
+    weights = pixel_weights(TWENTY_IN_A_ROW, camera(1, 1), NEAR).toarray().ravel()
     np.testing.assert_allclose(weights[:4], 0.9 * 0.1 ** np.arange(4), rtol=1e-3)
     assert (weights[4:] == 0).all()  # the fifth would leave 1e-5
 
 
 def test_cutoffs_leave_out_what_they_say() -> None:
-    splat = Gaussians(
-        np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.float32), IDENTITY[None], np.float32([0.5])
-    )
     view, ids = camera(5, 5, 10.0, fy=10.0), np.arange(25, dtype=np.int32).reshape(5, 5)
-    shown = view_weights(splat, view, ids, 25, NEAR, cutoffs=Cutoffs(alpha_min=1 / 32)).rows.toarray()[:25]
+    shown = view_weights(DOT, view, ids, 25, NEAR, cutoffs=Cutoffs(alpha_min=1 / 32)).rows.toarray()[:25]
     assert (shown.reshape(5, 5) > 0).astype(int).tolist() == [
         [0] * 5, [0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0], [0] * 5
     ]  # fmt: skip
-    xyz = np.stack([np.zeros(20), np.zeros(20), np.linspace(1, 2, 20)], axis=1).astype(np.float32)
-    wall = Gaussians(xyz, np.full((20, 3), 50, np.float32), np.tile(IDENTITY, (20, 1)), np.full(20, 0.9, np.float32))
     one = camera(1, 1), np.zeros((1, 1), np.int32), 1, NEAR
-    weights = view_weights(wall, *one, cutoffs=Cutoffs(transmittance_min=1e-2)).rows.toarray()[0]
+    weights = view_weights(TWENTY_IN_A_ROW, *one, cutoffs=Cutoffs(transmittance_min=1e-2)).rows.toarray()[0]
     np.testing.assert_allclose(weights[:2], [0.9, 0.09], rtol=1e-3)
     assert (weights[2:] == 0).all()
 
@@ -382,19 +371,12 @@ def view_of(camera: Camera, count: int = MASKS, name: str = "view") -> View:
 def test_exposure_of_a_lone_splat_is_about_one() -> None:
     """Not exactly: pixels sample the splat."""
     for scale, opacity in ((0.01, 0.9), (0.1, 0.3), (0.2, 0.95)):
-        splat = Gaussians(
-            np.array([[0.05, 0.02, 2]], np.float32), np.full((1, 3), scale, np.float32), IDENTITY[None],
-            np.float32([opacity]),
-        )  # fmt: skip
-        table = mask_table(splat, [view_of(camera())], NEAR)
+        table = mask_table(round_splats([[0.05, 0.02, 2]], scale, opacity), [view_of(camera())], NEAR)
         np.testing.assert_allclose(table.exposure.toarray(), 1, atol=0.1)
 
 
 def test_exposure_behind_another_splat_is_what_it_lets_through() -> None:
-    xyz = np.array([[0, 0, 1], [0, 0, 2]], np.float32)
-    scale = np.array([[5] * 3, [0.2] * 3], np.float32)
-    two = Gaussians(xyz, scale, np.tile(IDENTITY, (2, 1)), np.array([0.7, 0.9], np.float32))
-    exposure = mask_table(two, [view_of(camera())], NEAR).exposure.toarray().ravel()
+    exposure = mask_table(ONE_BEHIND_ANOTHER, [view_of(camera())], NEAR).exposure.toarray().ravel()
     np.testing.assert_allclose(exposure[1], 0.3, atol=0.03)
 
 
@@ -424,12 +406,9 @@ def test_what_shows_through_a_surface_equals_the_reference(random: Generator) ->
 
 
 def test_what_is_seen_through_a_surface_has_a_small_exposure() -> None:
-    xyz = np.array([[0, 0, 1], [0, 0, 2]], np.float32)
-    scale = np.array([[5] * 3, [0.2] * 3], np.float32)
-    two = Gaussians(xyz, scale, np.tile(IDENTITY, (2, 1)), np.array([0.7, 0.9], np.float32))
     far, near = (
-        mask_table(two, [view_of(camera())], NEAR, np.full(2, thickness, np.float32)).exposure.toarray().ravel()
-        for thickness in (0.9, 1.1)
+        mask_table(ONE_BEHIND_ANOTHER, [view_of(camera())], NEAR, np.full(2, thick, np.float32)).exposure.toarray()[0]
+        for thick in (0.9, 1.1)
     )
     assert far[0] == near[0]
     np.testing.assert_allclose(far[1], 0.1 * near[1], rtol=1e-5)
