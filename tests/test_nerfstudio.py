@@ -18,11 +18,13 @@ def read(folder, image_size=no_size):
     return read_transforms(folder / "transforms.json", image_size)
 
 
-def test_a_point_in_front_of_the_camera_has_positive_depth(tmp_path):
-    """Independent of any inverse: an OpenGL camera at (1, 2, 3) that looks along world -z, its own."""
-    matrix = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+@pytest.mark.parametrize(("side", "keys"), [(1, {"from_mitsuba": False}), (-1, {"from_mitsuba": True})])
+def test_a_point_in_front_of_the_camera_has_positive_depth(tmp_path, side, keys):
+    """Independent of any inverse: an OpenGL camera at (1, 2, 3) that looks along world -z, its own; Mitsuba's looks
+    along its z, and its x points to the left."""
+    matrix = [[side, 0, 0, 1], [0, 1, 0, 2], [0, 0, side, 3], [0, 0, 0, 1]]
     frame = {"file_path": "a.png", "transform_matrix": matrix}
-    content = {"fl_x": 50, "w": 64, "h": 48, "frames": [frame]}
+    content = {"fl_x": 50, "w": 64, "h": 48, "frames": [frame], **keys}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     camera = read(tmp_path).images[0].camera
     right_up_ahead = np.array([1 + 0.5, 2 + 0.25, 3 - 4.0, 1.0])

@@ -3,8 +3,8 @@
 Intrinsics are at the top level or in a frame, which overrides it: ``fl_x fl_y cx cy w h`` in pixels, or
 ``camera_angle_x`` (radians over the width) or ``x_fov`` (degrees), with the principal point in the middle unless given.
 A focal length of one axis holds for both. Of the splits that Blender writes, ``transforms_train.json`` is read.
-``aabb_scale``, ``scale``, ``offset`` and the like describe the rendering box of instant-ngp, not the poses, and are
-ignored.
+``from_mitsuba`` (instant-ngp) means Mitsuba's axes (x left, z forward). ``aabb_scale``, ``scale``, ``offset`` and the
+like describe the rendering box of instant-ngp, not the poses, and are ignored.
 
 A frame's ``depth_file_path``, or ``depth_path`` (instant-ngp; a file that is absent is skipped), names its depth image
 inside the capture folder; stored integers are millimeters unless ``integer_depth_scale`` (instant-ngp, integers only)
@@ -41,6 +41,8 @@ OTHER_LENSES = ("ftheta", "latlong", "equirectangular", "orthographic")
 """Keys of instant-ngp, whose presence alone means one of its lenses that are not read."""
 DEPTH_KEYS = ("depth_file_path", "depth_path")
 FOCAL_KEYS = (("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y"), ("x_fov", "y_fov"))
+MITSUBA_SIGNS = np.array([-1.0, 1.0, -1.0, 1.0])
+"""Factors of a pose's columns from Mitsuba's axes (x left, y up, z forward) to OpenGL's."""
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
@@ -56,6 +58,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             f"{file} has no list 'frames' with at least one frame; expected nerfstudio's or instant-ngp's layout"
         )
     shared = {key: value for key, value in content.items() if key != "frames"}  # a frame's own keys override these
+    signs = OPENGL_SIGNS * MITSUBA_SIGNS if shared.get("from_mitsuba") else OPENGL_SIGNS
     images, dropped = [], []
     for index, frame in enumerate(frames):
         path = frame.get("file_path") if isinstance(frame, dict) else None
@@ -66,7 +69,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             camera_to_world = _matrix(frame, "transform_matrix")
             if np.isfinite(camera_to_world).all():  # trackers write NaN when they get lost
                 keys = _overridden(shared, frame)
-                camera = _camera(keys, inverse(camera_to_world * OPENGL_SIGNS), partial(image_size, path))
+                camera = _camera(keys, inverse(camera_to_world * signs), partial(image_size, path))
                 lens = _lens(keys)
                 units = _depth_unit(keys, "depth_unit_scale_factor"), _depth_unit(keys, "integer_depth_scale")
                 depth_path = _depth_path(file.parent, keys, lens)
