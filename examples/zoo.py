@@ -63,7 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.needs:
             _needs(chosen, options)
         else:
-            _report(_rows(chosen, options, parsed(options.worse)), options.output)
+            file = options.output / "zoo.csv"
+            rows = _rows(chosen, options, parsed(options.worse), file)
+            print(f"{summary(rows)}\n\n{file}\n{write_picture(rows, options.output / 'zoo.png')}")
     except OgPointcloudError as error:
         sys.exit(f"zoo: {error}")
 
@@ -79,13 +81,15 @@ def _write_constants(options: argparse.Namespace) -> None:
 def _needs(paths: Sequence[Path], options: argparse.Namespace) -> None:
     rows, file = [], options.output / "needs.csv"
     for change in ({}, *({kind: amount} for kind, amounts in LADDER.items() for amount in amounts)):
-        rows += _rows(paths, options, change)
-        write_csv(rows, file)  # results are kept in case of an interruption
+        rows = _rows(paths, options, change, file, rows)
     print(f"\n{needs_table(rows)}\n\n{file}\n{write_needs(rows, options.output / 'needs.png')}")
 
 
-def _rows(paths: Sequence[Path], options: argparse.Namespace, changes: Mapping[str, Any]) -> list[Row]:
-    settings, rows = parsed_settings(options.set), []
+def _rows(
+    paths: Sequence[Path], options: argparse.Namespace, changes: Mapping[str, Any], file: Path, rows: Sequence[Row] = ()
+) -> list[Row]:
+    """The rows so far and one more for each scene; after each all are written, in case of an interruption."""
+    settings, rows = parsed_settings(options.set), list(rows)
     print(HEADER)
     for path in paths:
         folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
@@ -93,13 +97,8 @@ def _rows(paths: Sequence[Path], options: argparse.Namespace, changes: Mapping[s
             warm_up(read_capture(folder))
         rows.append(measure(folder, settings, baselines=not options.quick, changes=changes))
         print(line(rows[-1]), flush=True)
-        write_csv(rows, options.output / "zoo.csv")
+        write_csv(rows, file)
     return rows
-
-
-def _report(rows: Sequence[Row], folder: Path) -> None:
-    print(summary(rows))
-    print(f"\n{write_csv(rows, folder / 'zoo.csv')}\n{write_picture(rows, folder / 'zoo.png')}")
 
 
 if __name__ == "__main__":

@@ -149,11 +149,15 @@ def test_the_summary_names_scenes_where_a_baseline_is_better():
     assert "1 of 1 scenes 1 % or more" in text
 
 
-@pytest.mark.slow
-def test_measuring_without_baselines_leaves_them_out(scenes):
-    row = measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False)
-    assert row.baseline is None
-    assert 0 < row.miou <= 1
+def test_a_mask_shows_the_thing_that_fills_most_of_it_below_a_sky_too():
+    made = small("street-0")
+    expected = []
+    for ids, frame in zip(made.masks, made.frames, strict=True):
+        for mask in range(1, int(ids.max()) + 1):
+            things = frame.owner[(ids == mask) & (frame.owner >= 0)]
+            expected.append(np.bincount(things).argmax() if len(things) else -1)
+    assert min(frame.owner.min() for frame in made.frames) < -1
+    np.testing.assert_array_equal(made.mask_instance, expected)
 
 
 # Places outdoors, and what measures them -------------------------------------------------------------------------
@@ -242,6 +246,8 @@ def test_every_number_of_the_default_way_has_a_source_and_no_source_is_of_none()
     assert {one.path for one in numbers.constants() if one.source == "not said"} == set()
     assert sorted(said) == sorted(known)
     assert all(one.meaning for one in numbers.constants())
+    for path, (_, functions) in numbers.MODULES.items():
+        assert all(hasattr(numbers._module(path)[0], function) for function in functions), path
     assert {half_of(name) for name in numbers.SCENES} == {"choose"}
 
 
@@ -402,6 +408,9 @@ def test_a_worse_scene_is_scored_at_the_points_it_had(scenes):
     with_strays = measure(scenes[0], baselines=False, changes={"strays": 0.3})
     assert with_strays.miou > 0.5
     assert with_strays.worse == "strays=0.3"
+    thin_with_many_strays = measure(scenes[0], baselines=False, changes={"points": 0.8, "strays": 0.3})
+    assert thin_with_many_strays.points > len(capture.points)
+    assert thin_with_many_strays.miou > 0.5
 
 
 @pytest.mark.parametrize("change", ["views=0", "points=1.5", "masks=no", "colors=blue", "light=1"])
@@ -422,7 +431,9 @@ def test_what_a_capture_needs_is_a_table_and_a_plot(scenes, tmp_path, monkeypatc
     with (tmp_path / "needs.csv").open() as file:
         rows = {row["worse"]: row for row in csv.DictReader(file)}
     assert list(rows) == ["", "views=3", "poses=40"]
+    assert not (tmp_path / "zoo.csv").exists()  # it is of scenes as they are
     as_it_is = measure(scenes[0], baselines=False)
+    assert as_it_is.baseline is None
     assert float(rows[""]["miou"]) == pytest.approx(as_it_is.miou)
     assert float(rows["poses=40"]["miou"]) < as_it_is.miou - 0.2  # of 96 pixels
     said = capsys.readouterr().out

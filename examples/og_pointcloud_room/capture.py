@@ -93,8 +93,9 @@ class RoomCapture:
     @property
     def mask_instance(self) -> NDArray[np.int32]:
         """(masks of all views,) the object that fills most of each mask, -1 where it shows none."""
-        views = zip(self.masks, self.frames, strict=True)
-        areas = np.concatenate([_area_px(ids, frame.owner, len(self.room.objects)) for ids, frame in views])
+        owners = [np.maximum(frame.owner, BACKGROUND) for frame in self.frames]  # a street also has a sky, below it
+        objects = 1 + max(0, *(int(owner.max()) for owner in owners))
+        areas = np.concatenate([_area_px(ids, own, objects) for ids, own in zip(self.masks, owners, strict=True)])
         return np.where(areas.any(axis=1), areas.argmax(axis=1), -1).astype(np.int32)
 
 
@@ -103,19 +104,19 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
     settings = settings or CaptureSettings()
     noise = MaskNoise().scaled(settings.mask_noise)
     room = furnish(seed)
-    caster = RayCaster(room, _stream(seed, TEXTURE))
+    caster = RayCaster(room, stream(seed, TEXTURE))
     intrinsics = Intrinsics(settings.width, settings.height, 0.82 * settings.width)
-    path = walk(room, caster.surfaces, settings.views, _stream(seed, PATH))
+    path = walk(room, caster.surfaces, settings.views, stream(seed, PATH))
     frames = tuple(caster.look(intrinsics, pose) for pose in path)
     xyz, rgb, source = _fused_cloud(room, frames, intrinsics, settings, seed)
     instance, background = ground_truth(room, caster.surfaces, xyz, source)
     class_of_object = np.array([CLASS_NAMES.index(item.name) for item in room.objects], np.int32)
-    masks = tuple(propose_masks(frame.owner, noise, _stream(seed, MASKS, view)) for view, frame in enumerate(frames))
-    feature_rng, word_rng = _stream(seed, FEATURES), _stream(seed, WORDS)
+    masks = tuple(propose_masks(frame.owner, noise, stream(seed, MASKS, view)) for view, frame in enumerate(frames))
+    feature_rng, word_rng = stream(seed, FEATURES), stream(seed, WORDS)
     model = FeatureModel(len(CLASS_NAMES), feature_rng)
     looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
     features = tuple(
-        mask_features(ids, frame.owner, class_of_object, looks, model, noise.wrong_class, _stream(seed, FEATURES, view))
+        mask_features(ids, frame.owner, class_of_object, looks, model, noise.wrong_class, stream(seed, FEATURES, view))
         for view, (ids, frame) in enumerate(zip(masks, frames, strict=True))
     )
     cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
@@ -136,7 +137,8 @@ def everyday_vectors(model: FeatureModel, names: tuple[str, ...], rng: Random) -
     return bank
 
 
-def _stream(seed: int, purpose: int, *view: int) -> Random:
+def stream(seed: int, purpose: int, *view: int) -> Random:
+    """The random numbers of a scene for one purpose, and of one view."""
     return np.random.default_rng([seed, purpose, *view])
 
 
@@ -192,10 +194,10 @@ def _fused_cloud(
     room: Room, frames: tuple[Frame, ...], intrinsics: Intrinsics, settings: CaptureSettings, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
     """xyz (n, 3) float32, rgb (n, 3) uint8 and the object each point was sensed on: one noisy sample per voxel."""
-    sensed = [_sense(frame, intrinsics, settings, _stream(seed, CLOUD, view)) for view, frame in enumerate(frames)]
+    sensed = [_sense(frame, intrinsics, settings, stream(seed, CLOUD, view)) for view, frame in enumerate(frames)]
     xyz, rgb, source, in_range = (np.concatenate(column) for column in zip(*sensed, strict=True))
     # Outliers, anywhere in the room, belong to no object.
-    rng, count = _stream(seed, CLOUD), int(settings.outliers * len(xyz))
+    rng, count = stream(seed, CLOUD), int(settings.outliers * len(xyz))
     anywhere = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (count, 3)) * room.size
     xyz = np.concatenate([xyz, anywhere])
     rgb = np.concatenate([rgb, rng.integers(0, 256, (count, 3), np.uint8)])

@@ -72,7 +72,6 @@ class ChangedRoom:
 
     items: tuple[Item, ...]
     truth: NDArray[np.int32]
-    path: Points
 
 
 class Drive:
@@ -140,7 +139,7 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
         taken = np.concatenate([taken, place[None]])
         items.append(item.moved((*place, 0.0)))
         truth.append(what)
-    return ChangedRoom(tuple(items), np.array(truth, np.int32), path)
+    return ChangedRoom(tuple(items), np.array(truth, np.int32))
 
 
 def centered(item: Item) -> Item:

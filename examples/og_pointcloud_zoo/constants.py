@@ -75,12 +75,8 @@ TABLE = ("geometry", "membership.gap_sizes", "membership.front_share", "membersh
 """Settings that the mask table depends on."""
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
-    "derived": (
-        "grouping.container_share", "grouping.join_majority",
-    ),
-    "enough": (
-        "geometry.enough_views", "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
-    ),
+    "derived": ("grouping.container_share", "grouping.join_majority"),
+    "enough": ("geometry.enough_views", "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points"),
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbors", "geometry.reach",
         "grouping.witness_share", "grouping.left_out_voice", "grouping.spanning_share",
@@ -88,19 +84,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "membership.possible_share", "membership.possible_openly", "membership.growth_votes", "membership.rate_share",
         "membership.missed_chance", "membership.island_share",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
-        "fitting.colors.MAX_COLOR_RATIO", "fitting.colors.SURENESS_POWER", "fitting.seen_colors.SEEN_PRIOR",
-        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.MIN_LOOK_MASKS", "fitting.held_out.MIN_AGREEMENT_GAIN",
-        "fitting.association.SAME_KIND_BOUND", "fitting.association.DOMINANT_WEIGHT_RATIO",
-        "fitting.mask_edges.MIN_CONTRAST_RATIO", "fitting.mask_edges.MIN_STANDARD_ERRORS",
-        "fitting.view_reports.HIDDEN_REPORT_PROBABILITY", "fitting.view_reports.MIN_REPORT_PROBABILITY",
-        "fitting.view_reports.MAX_INDEPENDENT_VIEWS", "fitting.view_reports.PRIOR_COUNT",
-        "fitting.view_reports.BACKGROUND_LOG_PRIOR", "fitting.view_reports.SMOOTHNESS",
-        "fitting.view_reports.MIN_COLOR_RATIO", "fitting.view_reports.MAX_INFLUENCE",
-        "rendering.geometry.SPACING_MEDIAN_NEIGHBORS", "rendering.geometry.FLOATER_SPACINGS",
-        "rendering.geometry.FLOATER_SCATTER_SHARE", "rendering.sightings.MIN_OPENNESS", "rendering.sightings.EDGE_PX",
-        "rendering.sightings.RING_SHARE", "rendering.smoothing.NOISE_NEIGHBORS", "rendering.smoothing.NOISE_BIAS",
-        "rendering.pixel_cells.CELL_PIXELS", "rendering.pixel_cells.MAX_KEPT_SHARE",
-        "rendering.pixel_cells.NEAREST_SHARE",
+        *MODULES,
     ),
 }  # fmt: skip
 """Where numbers come from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
@@ -267,14 +251,12 @@ def _module(path: str) -> tuple[Any, str]:
 def _in_module(path: str, value: Any) -> Iterator[None]:
     """Changes a module's number temporarily; compiled functions that use it are recompiled, without a disk cache."""
     module, name = _module(path)
-    before, samples = getattr(module, name), getattr(module, "VOTE_SAMPLES", None)
+    before = getattr(module, name)
     try:
         _put(module, name, value, path)
         yield
     finally:
         _put(module, name, before, path)
-        if samples is not None:
-            module.VOTE_SAMPLES = samples
 
 
 def _put(module: Any, name: str, value: Any, path: str) -> None:

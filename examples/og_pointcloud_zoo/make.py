@@ -22,6 +22,7 @@ from og_pointcloud_room.capture import (
     ground_truth,
     make_capture,
     mask_features,
+    stream,
     write_capture,
 )
 from og_pointcloud_room.features import FeatureModel
@@ -60,10 +61,6 @@ def made_scene(draw: Draw, cache: Path) -> Path:
     return folder
 
 
-def _stream(draw: Draw, purpose: int, *view: int) -> np.random.Generator:
-    return np.random.default_rng([draw.seed, purpose, *view])
-
-
 def drawn_capture(draw: Draw) -> RoomCapture:
     """A scene with its truth, in memory."""
     if draw.place == "street":
@@ -75,7 +72,7 @@ def drawn_capture(draw: Draw) -> RoomCapture:
 
 
 def _place(draw: Draw) -> RoomCapture:
-    rng = _stream(draw, CLOUD)
+    rng = stream(draw.seed, CLOUD)
     place = PLACES[draw.place](rng, draw.seed)
     room = place.room
     if draw.all_masked:
@@ -83,10 +80,10 @@ def _place(draw: Draw) -> RoomCapture:
     intrinsics = Intrinsics(draw.width, draw.height, 0.82 * draw.width)
     # A depth sensor looks through glass: the cloud shows the room without it, photographs may show it.
     sensed = _without(room, [k for k, item in enumerate(room.objects) if item.name == GLASS])
-    caster = RayCaster(sensed, _stream(draw, TEXTURE))
-    poses = place.poses(draw.views, caster.surfaces, _stream(draw, PATH))
+    caster = RayCaster(sensed, stream(draw.seed, TEXTURE))
+    poses = place.poses(draw.views, caster.surfaces, stream(draw.seed, PATH))
     sensed_frames = [caster.look(intrinsics, pose) for pose in poses]
-    frames = _shown(draw, room, sensed, intrinsics, sensed_frames)
+    frames = _shown(draw, room, intrinsics, sensed_frames)
     sensor = place.sensor(sensed_frames, intrinsics) if place.sensor else _Sampler(sensed, draw.backdrop)
     xyz, rgb, source, views = _cloud(draw, sensor, sensed, caster.surfaces, sensed_frames, intrinsics, rng)
     instance, background = ground_truth(sensed, caster.surfaces, xyz, source)
@@ -95,12 +92,12 @@ def _place(draw: Draw) -> RoomCapture:
     names = place.names
     class_of = np.array([names.index(item.name) for item in room.objects], np.int32)
     masked = _masked(draw, room, frames, intrinsics)
-    feature_rng, word_rng = _stream(draw, FEATURES), _stream(draw, WORDS)
+    feature_rng, word_rng = stream(draw.seed, FEATURES), stream(draw.seed, WORDS)
     model = FeatureModel(len(names), feature_rng)
     looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
     named = _named(draw, class_of, names, len(masked))
     features = tuple(
-        mask_features(ids, frame.owner, named[view], looks, model, draw.wrong_class, _stream(draw, FEATURES, view))
+        mask_features(ids, frame.owner, named[view], looks, model, draw.wrong_class, stream(draw.seed, FEATURES, view))
         for view, (frame, ids) in enumerate(masked)
     )
     cls = np.where(instance >= 0, class_of[instance], -1).astype(np.int32)
@@ -115,7 +112,7 @@ def _named(draw: Draw, class_of: Owners, names: tuple[str, ...], views: int) -> 
     """(views, objects) the class that an encoder takes each object for: its own, or one alike."""
     found = np.repeat(class_of[None], views, axis=0)
     if draw.confused:
-        rng = _stream(draw, FEATURES, 0, 0)
+        rng = stream(draw.seed, FEATURES, 0, 0)
         for k, own in enumerate(class_of):
             others = [name for group in ALIKE if names[own] in group for name in group if name in names]
             others = [names.index(name) for name in others if name != names[own]] or [own]
@@ -130,17 +127,17 @@ def _without(room: Room, gone: list[int]) -> Room:
     return replace(room, objects=tuple(objects))
 
 
-def _shown(draw: Draw, room: Room, sensed: Room, intrinsics: Intrinsics, frames: list[Frame]) -> list[Frame]:
+def _shown(draw: Draw, room: Room, intrinsics: Intrinsics, frames: list[Frame]) -> list[Frame]:
     """The frames with what photographs show differently from the depth sensor: panes, and things taken away."""
-    rng, shown = _stream(draw, TEXTURE, 1), list(frames)
-    if sensed is not room and any(item.name == GLASS for item in room.objects):
-        pane = RayCaster(room, _stream(draw, TEXTURE))
+    rng, shown = stream(draw.seed, TEXTURE, 1), list(frames)
+    if any(item.name == GLASS for item in room.objects):
+        pane = RayCaster(room, stream(draw.seed, TEXTURE))
         for view, frame in enumerate(frames):
             if rng.uniform() < 0.5:  # a proposer masks the pane or what is behind it
                 shown[view] = replace(frame, owner=pane.look(intrinsics, frame.camera_to_world).owner)
     if draw.taken:
         small = [k for k, item in enumerate(room.objects) if item.name in (*SMALL, "chair")]
-        later = RayCaster(_without(room, rng.permutation(small)[: draw.taken].tolist()), _stream(draw, TEXTURE))
+        later = RayCaster(_without(room, rng.permutation(small)[: draw.taken].tolist()), stream(draw.seed, TEXTURE))
         for view in range(len(frames) // 2, len(frames)):
             shown[view] = later.look(intrinsics, frames[view].camera_to_world)
     return shown
@@ -157,18 +154,17 @@ def _masked(
     noise = MaskNoise(
         draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px, swallow=draw.swallow
     )
-    noises = [
-        noise if not blurred else _blurred(noise) for blurred in _stream(draw, MASKS).random(len(frames)) < draw.blurred
-    ]
+    blurred = stream(draw.seed, MASKS).random(len(frames)) < draw.blurred
+    noises = [_blurred(noise) if moves else noise for moves in blurred]
     owners = [[_together(room, draw.spans)[frame.owner]] for frame in frames]
     if draw.levels:
         parts = [Item(item.name, (part,)) for item in room.objects for part in item.parts]
-        caster = RayCaster(replace(room, objects=tuple(parts)), _stream(draw, TEXTURE))
+        caster = RayCaster(replace(room, objects=tuple(parts)), stream(draw.seed, TEXTURE))
         whole = _together(room, len(room.objects))
         for view, frame in enumerate(frames):
             owners[view] += [caster.look(intrinsics, frame.camera_to_world).owner, whole[frame.owner]]
     return [
-        (frame, propose_masks(owner, noises[view], _stream(draw, MASKS, view, level)))
+        (frame, propose_masks(owner, noises[view], stream(draw.seed, MASKS, view, level)))
         for view, (frame, levels) in enumerate(zip(frames, owners, strict=True))
         for level, owner in enumerate(levels)
     ]
@@ -299,21 +295,15 @@ def _views(
 
 
 def _floaters(frames: list[Frame], intrinsics: Intrinsics, count: int, rng: np.random.Generator) -> Doubles:
-    """(count, 3) points between cameras and what they see."""
-    places = rng.random((count, 3))
-    return _at_depths(frames, intrinsics, places[:, :2], 0.15 + 0.7 * places[:, 2])
-
-
-def _at_depths(frames: list[Frame], intrinsics: Intrinsics, places: Doubles, share: Doubles) -> Doubles:
-    """(n, 3) points at a share of the depth of pixels. places: (n, 2) in [0, 1), choosing the frame and its pixel."""
-    view = (places[:, 0] * len(frames)).astype(int)
-    pixel = (places[:, 1] * intrinsics.width * intrinsics.height).astype(int)
+    """(count, 3) points between cameras and what a random pixel of them sees."""
+    view, pixel, share = rng.random((count, 3)).T
     directions = intrinsics.directions().reshape(-1, 3)
-    xyz = np.zeros((len(places), 3))
+    view, pixel = (view * len(frames)).astype(int), (pixel * len(directions)).astype(int)
+    xyz = np.zeros((count, 3))
     for index, (frame, at) in enumerate(zip(view, pixel, strict=True)):
         pose = frames[frame].camera_to_world
         ray = (pose[:3, :3] * directions[at]).sum(axis=1)
-        xyz[index] = pose[:3, 3] + share[index] * frames[frame].depth_m.ravel()[at] * ray
+        xyz[index] = pose[:3, 3] + (0.15 + 0.7 * share[index]) * frames[frame].depth_m.ravel()[at] * ray
     return xyz
 
 
@@ -369,6 +359,6 @@ def _street(draw: Draw) -> RoomCapture:
         tuple((view.mask_map() + 1).astype(np.uint16) for view in made.scene.views),
         tuple(view.mask_features for view in made.scene.views), model.texts, points.xyz, points.rgb,
         np.where(owner >= 0, street.cls[owner], -1).astype(np.int32), owner, (owner < 0) & (views > 0),
-        everyday_vectors(model, CLASSES, _stream(draw, WORDS)), model.words(50, _stream(draw, WORDS, 1)), CLASSES,
-        views,
+        everyday_vectors(model, CLASSES, stream(draw.seed, WORDS)), model.words(50, stream(draw.seed, WORDS, 1)),
+        CLASSES, views,
     )  # fmt: skip

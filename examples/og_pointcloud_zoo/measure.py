@@ -24,7 +24,6 @@ from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud_zoo.draws import half_of
@@ -69,17 +68,18 @@ def measure(
     changes: kind -> amount by which the capture is made worse before the fit (`worse`). It is scored at all its points:
     those that were left out take the label of the nearest one that was not.
     """
-    capture, truth = read_capture(folder), read_truth(folder)
+    capture, truth, changes = read_capture(folder), read_truth(folder), changes or {}
     scene = capture
-    for kind, amount in (changes or {}).items():
+    for kind, amount in changes.items():
         scene = worse(scene, kind, amount)
     start, worked = time.perf_counter(), time.process_time()
     journal = Journal(progress=False)
     prepared = prepare(scene, settings, journal)
     cloud = fit_prepared(prepared, settings, journal)
     seconds, worked = time.perf_counter() - start, time.process_time() - worked
-    at = _place_of_points(capture, scene)
-    at_points = replace(cloud, xyz=capture.points.xyz, instance_ids=cloud.instance_ids[at], rgb=None, certainty=None)
+    xyz = capture.points.xyz  # only "points" changes their rows: strays come after them
+    at = np.asarray(cKDTree(scene.points.xyz).query(xyz)[1]) if "points" in changes else np.arange(len(xyz))
+    at_points = replace(cloud, xyz=xyz, instance_ids=cloud.instance_ids[at], rgb=None, certainty=None)
     answer = answered(folder, at_points, truth)
     score = truth.score(answer.called)
     row = Row(
@@ -93,15 +93,9 @@ def measure(
         seconds=seconds,
         core_seconds=worked,
         reliability=cloud.reliability,
-        worse=" ".join(f"{kind}={amount}" for kind, amount in (changes or {}).items()),
+        worse=" ".join(f"{kind}={amount}" for kind, amount in changes.items()),
     )
     return _beside_baselines(row, folder, prepared, at, answer, truth, score.classes) if baselines else row
-
-
-def _place_of_points(capture: Scene, scene: Scene) -> NDArray[np.integer]:
-    """(n,) the point of the worse scene that each point of the capture takes its label from."""
-    xyz, left = capture.points.xyz, scene.points.xyz
-    return np.arange(len(xyz)) if len(left) >= len(xyz) else np.asarray(cKDTree(left).query(xyz)[1])
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:

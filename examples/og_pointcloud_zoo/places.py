@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -180,12 +180,10 @@ def flat(rng: Random, seed: int) -> Place:
 
 def _at_wall(rng: Random, group: Group, extra: list[Item], angle: float, distance: tuple[float, float]) -> Place:
     """A group with its back to a wall, seen from its front."""
-    made = _in_shell(rng, [*group.items, *extra], (5.0, 4.0, 2.6))
     back = 2.0 - group.depth / 2 - 0.02
-    objects = tuple(item.moved((0, back, 0)) for item in made.objects)
+    made = _in_shell(rng, [item.moved((0, back, 0)) for item in (*group.items, *extra)], (5.0, 4.0, 2.6))
     top = max(item.vertices[:, 2].max() for item in group.items)
-    middle = (0.0, back, 0.5 * top)
-    return Place(replace(made, objects=objects), _Arc(middle, angle, distance, (0.4 * top, 0.9 * top + 0.5)))
+    return Place(made, _Arc((0.0, back, 0.5 * top), angle, distance, (0.4 * top, 0.9 * top + 0.5)))
 
 
 def shelf(rng: Random, seed: int) -> Place:
@@ -195,8 +193,7 @@ def shelf(rng: Random, seed: int) -> Place:
 
 def shelf_bin(rng: Random, seed: int) -> Place:
     """The same from close up and nearly one place: one or two of its compartments."""
-    far = _at_wall(rng, shelf_group(rng), [], 0.9, (0.7, 0.9))
-    return replace(far, poses=_Arc((0.0, 1.8, 0.75), 0.9, (0.75, 0.95), (0.8, 1.2)))
+    return replace(shelf(rng, seed), poses=_Arc((0.0, 1.8, 0.75), 0.9, (0.75, 0.95), (0.8, 1.2)))
 
 
 def desk(rng: Random, seed: int) -> Place:
@@ -292,6 +289,14 @@ def _ahead(views: int, place: Callable[[float], np.ndarray], headings: Sequence[
     return poses
 
 
+def _scanner(
+    room: Room, stops: Sequence[Frame], rng: Random, beams: int, soft: Mapping[str, float], *, colored: bool
+) -> Scanner:
+    """A scanner above the camera of each stop, each sweep a little off its place."""
+    places = np.stack([frame.camera_to_world[:3, 3] + ON_ROOF for frame in stops])
+    return Scanner(room, places, rng.normal(0, 0.03, places.shape), beams, soft, colored)
+
+
 def _in_lane(share: float) -> Pose:
     return np.array([-28 + 46 * share, -1.6 + 0.2 * np.sin(9 * share), 1.65])
 
@@ -307,18 +312,15 @@ def drive(rng: Random, seed: int) -> Place:
 
 def lidar(rng: Random, seed: int) -> Place:
     """A street by a 32-beam scanner on a car's roof and six cameras around it, at a few stops."""
-    room = street_room(rng)
-    around = (0, 60, 120, 180, 240, 300)
+    room, around, soft = street_room(rng), (0, 60, 120, 180, 240, 300), {"tree": 0.3}
 
     def sensor(frames: Sequence[Frame], intrinsics: Intrinsics) -> Sensor:
-        places = np.stack([frame.camera_to_world[:3, 3] + ON_ROOF for frame in frames[:: len(around)]])
-        drift = rng.normal(0, 0.03, places.shape)
-        return Scanner(room, places, drift, 32, {"tree": 0.3}, colored=True)
+        return _scanner(room, frames[:: len(around)], rng, 32, soft, colored=True)
 
     def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
         return _ahead(views, lambda share: _in_lane(0.4 + 0.25 * share), around, rng)
 
-    return Place(room, poses, STREET, sensor, frozenset({"tree"}))
+    return Place(room, poses, STREET, sensor, frozenset(soft))
 
 
 def country(rng: Random, seed: int) -> Place:
@@ -338,9 +340,7 @@ def country(rng: Random, seed: int) -> Place:
         ]
 
     def sensor(frames: Sequence[Frame], intrinsics: Intrinsics) -> Sensor:
-        places = np.stack([frame.camera_to_world[:3, 3] + ON_ROOF for frame in frames[::3]])
-        drift = rng.normal(0, 0.03, places.shape)
-        return Scanner(room, places, drift, 64, soft, colored=False)
+        return _scanner(room, frames[::3], rng, 64, soft, colored=False)
 
     return Place(room, poses, COUNTRY, sensor, frozenset(soft))
 
