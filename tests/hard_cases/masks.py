@@ -62,12 +62,6 @@ def masks_without_pixels() -> object:
     return fit(_with_masks(lambda _, ids: 0 * ids - 1), progress=False)
 
 
-@refuses(SceneError, "mask id 2 has no feature row", "the features file has 1", "write one feature row per mask id")
-def mask_without_a_row() -> object:
-    """A mask id beyond the rows of features."""
-    return fit(_with_masks(lambda _, ids: ids, unit_rows(1, 8)), progress=False)
-
-
 @refuses(SceneError, "the mask map contains -3", "expected rows of mask_features, -1 or -2", "set pixels")
 def mask_id_below_none() -> object:
     """A mask id of -3, below those for "no mask" and "not seen"."""

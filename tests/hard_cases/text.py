@@ -1,4 +1,4 @@
-"""One word, ten thousand, words given twice, of nothing, of emoji, and vectors that say nothing."""
+"""One word, ten thousand, words of nothing, of emoji, and vectors that say nothing."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from hard_cases import naive
 from hard_cases.case import Answer, agrees, powers, refuses
-from hard_cases.inputs import SPACE, labelled_cloud, unit_rows
+from hard_cases.inputs import labelled_cloud, unit_rows
 from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, load, segment
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text.text_features import read_text_features
 
 
 @agrees(1e-6, "length of a word's vector", (1e-44, 1e-38, 1e-30, *powers(-20, 20, 10), 1e30, 1e37))
@@ -85,18 +84,6 @@ def instances_without_descriptors() -> Answer:
     return Answer(segment(cloud, {"chair": [1.0, 2.0]}).labels, np.full(200, -1, np.int32))
 
 
-@refuses(OgPointcloudError, "'word 1' is given twice", "expected different names", "remove one")
-def word_given_twice() -> object:
-    """A list with a word in it twice."""
-    return segment(labelled_cloud(), ["word 1", "word 2", "word 1"])
-
-
-@refuses(OgPointcloudError, "0 labels are given", "expected at least one word", "name what you want to find")
-def no_word() -> object:
-    """An empty list of words."""
-    return segment(labelled_cloud(), [])
-
-
 @refuses(OgPointcloudError, "row 0 has an empty name", "expected a word", "name it or remove it")
 def empty_word() -> object:
     """The empty string as a word, with a vector."""
@@ -107,15 +94,6 @@ def empty_word() -> object:
 def empty_word_without_a_vector() -> object:
     """The empty string as a word to look up."""
     return segment(labelled_cloud(), "")
-
-
-@refuses(FeatureSpaceError, "row 1 has an empty name", "expected a word", "name it or remove it")
-def empty_word_in_a_file() -> object:
-    """A file of words with an empty one."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "words.npz"
-        np.savez(path, names=np.array(["chair", " "]), vectors=unit_rows(2, 16), feature_space=np.array(SPACE))
-        return read_text_features(path)
 
 
 @refuses(FeatureSpaceError, "the vector of 'chair' is zero", "similar to nothing", "encode it again")
