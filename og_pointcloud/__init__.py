@@ -104,13 +104,11 @@ _HOMES = {
 }  # fmt: skip
 """Module -> the public names that it defines; the imports above say the same to type checkers and editors."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-_MODULES = {"edit": "og_pointcloud.show.edit"}
-"""Modules used as they are: og.edit.remove."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return importlib.import_module(_MODULES[name])
+    if name == "edit":  # a module used as it is: og.edit.remove
+        return importlib.import_module("og_pointcloud.show.edit")
     if name not in _HOME_OF:
         raise AttributeError(f"module 'og_pointcloud' has no attribute '{name}'")
     try:
@@ -124,4 +122,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_MODULES})
+    return sorted({*globals(), *__all__, "edit"})

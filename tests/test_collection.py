@@ -13,11 +13,10 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from commands import error_of, output_of
+from commands import error_of, output_of, run
 from labelled_clouds import instance_table, unit_rows
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.collection.index import index
 from og_pointcloud.collection.lance import write_lance
@@ -474,9 +473,8 @@ def test_commands(folder, capsys, tmp_path):
         og.write_bundle(scene(things, k), folder / f"room{k}.ogpc")
     (folder / "broken.ogpc").write_bytes(b"x")
     atlas, page = str(tmp_path / "atlas"), tmp_path / "found.html"
-    assert main(["index", str(folder), "-o", atlas]) == 0
-    out, err = capsys.readouterr()
-    assert "2 added" in out
+    code, out, err = run(capsys, "index", folder, "-o", atlas)
+    assert (code, "2 added" in out) == (0, True)
     assert "2 scenes with 3 instances" in out
     assert out.splitlines()[-1].split()[-1] in ("chair", "mug"), "not 'bed', the first of all words"
     assert "broken is left out" in err
@@ -497,8 +495,7 @@ def test_commands(folder, capsys, tmp_path):
     assert "room1" in output_of(capsys, "find", atlas, "mug", "--scene", "room1", "--top", "1")
     assert "nothing was found" in output_of(capsys, "find", atlas, "mug", "--within", "5,5,5,6,6,6")
     for scenes, says in (("room0", False), ("room1", True)):  # the latter has a desk alone
-        assert main(["find", atlas, "mug", "--scene", scenes]) == 0
-        said = capsys.readouterr().out
+        said = output_of(capsys, "find", atlas, "mug", "--scene", scenes)
         assert (("nothing fits: no score" in said), ("next: " in said)) == (says, not says)
     (folder / "room0.ogpc").unlink()
     said = output_of(capsys, "find", atlas, "mug")
@@ -509,7 +506,7 @@ def test_commands(folder, capsys, tmp_path):
     for path in (folder / "bad" / "x.ogpc", folder / "nowhere"):
         assert f"'{path}' is not a folder" in error_of(capsys, "index", path, "-o", tmp_path / "bad")
     assert "<b>mug" in error_of(capsys, "find", atlas, "<b>mug", "--html", page)
-    assert main(["find", atlas, "mug", "--html", str(page)]) == 0
+    output_of(capsys, "find", atlas, "mug", "--html", page)
     assert "file not found" in page.read_text()
 
 
@@ -557,7 +554,7 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
     clouds = many(9, bank=BANK, noise=0.5) | {"cosines": scene(["bed", "rug"], 8, space="another/encoder")}
     exact = indexed(folder, clouds)
     uri, atlas = str(tmp_path / "lance"), str(folder.parent / "atlas")
-    assert main(["index", str(folder), "-o", atlas, "--lance", uri]) == 0
+    output_of(capsys, "index", folder, "-o", atlas, "--lance", uri)
     proposed = og.Collection(atlas, lance=uri)
     monkeypatch.setattr("og_pointcloud.collection.collection.MAX_EXACT_SCENES", 0)
     box = ([1.5, -1, -1], [9, 1, 1])
@@ -571,9 +568,7 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
     some = [found.find("bed", top=5, scenes="site1/*") for found in (exact, proposed)]
     assert [(f.scene, f.instance) for f in some[0]] == [(f.scene, f.instance) for f in some[1]]
     monkeypatch.undo()
-    capsys.readouterr()
-    assert main(["find", atlas, "bed", "--lance", uri, "--json", "--top", "1"]) == 0
-    assert len(json.loads(capsys.readouterr().out)) == 1
+    assert len(json.loads(output_of(capsys, "find", atlas, "bed", "--lance", uri, "--json", "--top", "1"))) == 1
     with pytest.raises(OgPointcloudError, match="is not a folder; expected one that og-pointcloud index --lance wrote"):
         og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")
     assert not (tmp_path / "other").exists()

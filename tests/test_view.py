@@ -83,6 +83,15 @@ def test_what_is_gone_is_no_instance_of_a_page(tmp_path):
     assert content(tmp_path / "p.html")["subtitle"].endswith(f" {len(cloud.instances) - 1} instances")
 
 
+def test_places_far_from_the_origin_are_told_to_a_tenth(tmp_path, capsys):
+    far = og.write_bundle(replace(room(300), origin=np.array([4000123.25, -500000.5, 30])), tmp_path / "far.ogpc")
+    output_of(capsys, "view", far, "--html", tmp_path / "far.html")
+    rows = content(tmp_path / "far.html")["instances"]
+    places = [row.centroid for row in og.load(far).instances]
+    assert [row["world"] for row in rows] == [f"{x:.1f}, {y:.1f}, {z:.4g}" for x, y, z in places]
+    assert "origin (4000123.25, -500000.5, 30)" in output_of(capsys, "info", far)
+
+
 def test_why_an_instance_has_no_words_is_said(tmp_path):
     cloud, page, view = room(300), tmp_path / "page.html", Viewpoint(np.ones(3), np.zeros(3), Z_UP)
     for known, note in ((cloud, "cosine: how similar"), (replace(cloud, vocabulary=None), "the scene stores no words")):

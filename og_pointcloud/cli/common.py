@@ -14,12 +14,11 @@ import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, counted, did_you_mean, printable
+from og_pointcloud.errors import OgPointcloudError, counted, did_you_mean, printable
 from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
@@ -198,13 +197,6 @@ def as_given(arguments: argparse.Namespace, *options: str) -> list[str]:
 def check_at_least(option: str, value: float | None, least: float) -> None:
     if value is not None and not value >= least:
         raise OgPointcloudError(f"{option} is {value}; expected at least {least}")
-
-
-def require_room() -> None:
-    # The room's modules import these where they need them: whoever lacks one needs the whole extra.
-    for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
-        if find_spec(module) is None:
-            raise MissingExtraError(module, "demo")
 
 
 def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:

@@ -6,10 +6,11 @@ og-pointcloud demo -o out/demo
 from __future__ import annotations
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, check_output, require_room
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.cli.common import Parser, add_option, check_output
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 
 def add(parser: Parser) -> None:
@@ -22,7 +23,10 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    require_room()
+    # The room's modules import these where they need them: whoever lacks one needs the whole extra.
+    for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
+        if find_spec(module) is None:
+            raise MissingExtraError(module, "demo")
     room = arguments.output / "room.ogpc"
     check_output("-o", room, [])
     begun = arguments.output / ".demo"

@@ -46,7 +46,7 @@ def print_info(scene: og.LabelledScene, path: Path) -> None:
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {writer}")
     sizes = f"{counted(len(cloud), 'point')}, {counted(len(cloud.instances), 'instance')}"
     print(f"{sizes}, feature space '{cloud.feature_space}'")
-    origin = ", ".join(f"{value:g}" for value in cloud.origin)
+    origin = ", ".join(f"{value:.10g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
     print(f"{counted(len(words), 'word')}: {common.some_of(words)}" if words else "no words of its own")
     if cloud.word_bank is None:

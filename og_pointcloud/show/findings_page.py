@@ -48,16 +48,13 @@ b {{ font-size: 15px }} .score {{ float: right }} .misfit {{ opacity: 0.4 }}
 
 def write_findings(path: StrPath, collection: Collection, findings: Findings, title: str) -> None:
     """Write the page atomically. title: the query."""
+    fitting = f"{sum(finding.fits for finding in findings)} of these {len(findings)} fit; pale ones do not"
     text = PAGE.format(
         title=html.escape(title),
-        notes="<br>".join(map(html.escape, [_fitting(findings), *findings.not_asked])),
+        notes="<br>".join(map(html.escape, [fitting, *findings.not_asked])),
         cards="\n".join(_card(rank, finding, collection) for rank, finding in enumerate(findings, 1)),
     )
     write_file(path, text.encode())
-
-
-def _fitting(findings: Findings) -> str:
-    return f"{sum(finding.fits for finding in findings)} of these {len(findings)} fit; pale ones do not"
 
 
 def _card(rank: int, finding: Finding, collection: Collection) -> str:
@@ -94,12 +91,9 @@ def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
         cloud, xyz=local[rows], origin=np.zeros(3), instance_ids=cloud.instance_ids[rows], rgb=None, certainty=None
     )
     eye = EYE_DISTANCE_WIDTHS * 2 * np.linalg.norm(reach) * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
-    front = front_points(
-        shown, Viewpoint(eye, np.zeros(3), UP_DIRECTION).camera(SIDE_PX, SIDE_PX, EYE_DISTANCE_WIDTHS * SIDE_PX)
-    )
-    return png_bytes(
-        np.append(colors, [[BACKGROUND_GRAY] * 3], axis=0).astype(np.uint8)[front]
-    )  # -1, no point, is the last
+    camera = Viewpoint(eye, np.zeros(3), UP_DIRECTION).camera(SIDE_PX, SIDE_PX, EYE_DISTANCE_WIDTHS * SIDE_PX)
+    palette = np.append(colors, [[BACKGROUND_GRAY] * 3], axis=0).astype(np.uint8)
+    return png_bytes(palette[front_points(shown, camera)])  # -1, no point, is the last
 
 
 def png_bytes(image: NDArray[np.uint8]) -> bytes:

@@ -19,7 +19,7 @@ from og_pointcloud.ask.boxes import axis_aligned_box
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.errors import OgPointcloudError, counted
+from og_pointcloud.errors import OgPointcloudError, coordinate, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning, meaning_of
@@ -135,7 +135,7 @@ def _instances(
         if points and row.oriented_box is not None and row.centroid is not None:
             record |= {
                 "box": (row.oriented_box.corners - middle).tolist(), "extent": row.oriented_box.size.tolist(),
-                "center": (row.centroid - middle).tolist(), "world": row.centroid.tolist(),
+                "center": (row.centroid - middle).tolist(), "world": ", ".join(map(coordinate, row.centroid)),
             }  # fmt: skip
         rows.append(record)
     return rows

@@ -15,6 +15,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
+import imageio.v3
 import numpy as np
 import viser
 
@@ -198,8 +199,6 @@ class LivePage:
 
     def _photograph(self, event: viser.GuiEvent) -> None:
         """Send the requesting browser its current view as a PNG to save."""
-        import imageio.v3
-
         client = event.client
         if client is None or client.client_id not in self._screens:
             return
