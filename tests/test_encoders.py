@@ -54,6 +54,19 @@ def test_preprocessing_is_read_from_either_file_of_transformers(tmp_path, file):
     assert clip.preprocessing_of(tmp_path, config) == Preprocessing(32, (0.4,) * 3, (0.2,) * 3, "bilinear")
 
 
+@pytest.mark.parametrize(
+    "stated",
+    [{"image_mean": None}, {"image_mean": ["a"] * 3}, {"image_mean": [0.5]}, {"image_std": [0, 1, 1]},
+     {"image_processor": []}],
+)  # fmt: skip
+def test_colors_that_are_no_colors_are_refused(tmp_path, stated):
+    clip = pytest.importorskip("og_pointcloud.masking.clip")
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(stated))
+    config = SimpleNamespace(model_type="clip", vision_config=SimpleNamespace(image_size=32))
+    with pytest.raises(SceneError, match="image_mean or image_std of its image processor cannot be used"):
+        clip.preprocessing_of(tmp_path, config)
+
+
 # Mask encoders
 
 
@@ -111,10 +124,6 @@ def test_an_encoder_is_found_by_its_folder_and_its_name(tmp_path, monkeypatch):
         open_encoder("tests/room")
     monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(tmp_path / "models"))
     assert (open_encoder("tests/room").embed(IMAGE, MASKS) == expected).all()
-
-
-def test_crops_are_the_exports():
-    assert open_encoder("demo").crops == OnnxModel(DEMO_FOLDER / "image").crops
 
 
 def exported(folder, name="manifest.json", edit=None, **fields):

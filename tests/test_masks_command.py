@@ -380,18 +380,6 @@ def test_colmap_captures(tmp_path):
         read_capture(capture)
 
 
-def test_an_existing_folder_of_masks_as_proposer(tmp_path):
-    world = make_capture(tmp_path / "c", 2)
-    for name in world.names:
-        ids = np.zeros((HEIGHT, WIDTH), np.uint8)
-        ids[10:30, 10:30], ids[5:9, 40:60] = 9, 200
-        (tmp_path / f"{name}.png").write_bytes(cv2.imencode(".png", ids)[1].tobytes())
-    made = make_masks(tmp_path / "c", MaskSettings(str(tmp_path), encoder=None, level="large"), progress=False)
-    assert made.masks == 4
-    ids = ids_of(tmp_path / "c", world.names[0])
-    assert sorted(np.bincount(ids.ravel())[1:].tolist()) == [80, 400]
-
-
 @pytest.mark.parametrize(("thing", "with_palette"), [(700, False), (200, True)])
 def test_ids_of_a_video_tracker_are_tracks_of_the_capture(tmp_path, thing, with_palette):
     world = make_capture(tmp_path / "c", 3)

@@ -28,31 +28,22 @@ DECODER = {
     "num_attention_heads": 2,
     "iou_head_hidden_dim": 32,
 }
-SQUARE = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
 
 
 def tiny_sam(kind: str):
-    """A model of a few thousand weights that takes 64x64 pixels."""
+    """A model of a few thousand weights that takes 64x64 pixels, SAM 3's 56x56."""
     torch.manual_seed(0)
-    t = transformers
+    name = {"sam": "Sam", "sam_hq": "SamHQ", "sam2": "Sam2", "sam3": "Sam3Tracker"}[kind]
+    prompt, decoder = {**PROMPT, "image_size": 64, "patch_size": 16}, DECODER
     if kind in ("sam", "sam_hq"):
         vision = {
             "hidden_size": 24, "output_channels": 32, "num_hidden_layers": 2, "num_attention_heads": 2,
             "image_size": 64, "patch_size": 16, "window_size": 2, "global_attn_indexes": [1], "mlp_dim": 32,
             "num_pos_feats": 16,
         }  # fmt: skip
-        prompt = {**PROMPT, "image_size": 64, "patch_size": 16, "image_embedding_size": 4}
-        if kind == "sam":
-            return t.SamModel(
-                t.SamConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
-            )
-        return t.SamHQModel(
-            t.SamHQConfig(
-                vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config={**DECODER, "vit_dim": 24}
-            )
-        )
-    prompt = {**PROMPT, "image_size": 64, "patch_size": 16}
-    if kind == "sam2":
+        prompt["image_embedding_size"] = 4
+        decoder = {**DECODER, "vit_dim": 24} if kind == "sam_hq" else DECODER
+    elif kind == "sam2":
         backbone = {
             "hidden_size": 8, "image_size": [64, 64],
             "blocks_per_stage": [1, 1, 2, 1], "window_size_per_stage": [8] * 4,
@@ -64,22 +55,19 @@ def tiny_sam(kind: str):
             "backbone_channel_list": [64, 32, 16, 8], "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
             "fpn_hidden_size": 32,
         }  # fmt: skip
-        return t.Sam2Model(
-            t.Sam2Config(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
-        )
-    backbone = {
-        "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2,
-        "num_attention_heads": 2, "image_size": 56, "patch_size": 14, "window_size": 2, "global_attn_indexes": [1],
-        "pretrain_image_size": 56,
-    }  # fmt: skip
-    vision = {
-        "model_type": "sam3_vision_model", "backbone_config": backbone, "fpn_hidden_size": 32,
-        "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
-    }  # fmt: skip
-    prompt = {**PROMPT, "image_size": 56, "patch_size": 14}
-    return t.Sam3TrackerModel(
-        t.Sam3TrackerConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
-    )
+    else:
+        backbone = {
+            "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2,
+            "num_attention_heads": 2, "image_size": 56, "patch_size": 14, "window_size": 2,
+            "global_attn_indexes": [1], "pretrain_image_size": 56,
+        }  # fmt: skip
+        vision = {
+            "model_type": "sam3_vision_model", "backbone_config": backbone, "fpn_hidden_size": 32,
+            "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
+        }  # fmt: skip
+        prompt = {**PROMPT, "image_size": 56, "patch_size": 14}
+    configs = {"vision_config": vision, "prompt_encoder_config": prompt, "mask_decoder_config": decoder}
+    return getattr(transformers, f"{name}Model")(getattr(transformers, f"{name}Config")(**configs))
 
 
 @pytest.fixture(scope="module")

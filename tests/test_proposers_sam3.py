@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from text_models import MERGES, VOCABULARY, clip_tokenizer
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.worker import open_proposer
 
 torch = pytest.importorskip("torch")
@@ -199,8 +197,3 @@ def test_what_is_missing_is_named(folder, tmp_path, change, says):
     words, followed = ((), 0) if change == "words" else (WORDS, None)
     with pytest.raises(SceneError, match=says):
         open_proposer(name, words, followed)
-
-
-def test_settings_are_kept_apart_by_words_and_tracks():
-    settings = MaskSettings()
-    assert len({settings, replace(settings, words=WORDS), replace(settings, tracks=True)}) == 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
-from og_pointcloud.masking.pretrained import Attention, best_device, load_pretrained, read_config, torch
+from og_pointcloud.masking.pretrained import (
+    Attention,
+    best_device,
+    load_pretrained,
+    read_config,
+    read_image_processor,
+    torch,
+)
 from og_pointcloud.models import MODEL_NAME
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
@@ -100,17 +107,15 @@ class TransformersModel:
 def preprocessing_of(folder: StrPath, config: Any) -> Preprocessing:
     """From the folder's preprocessor_config.json or processor_config.json, else that of the family's published models.
     config: the model's."""
-    stated = read_config(Path(folder), "preprocessor_config.json", "processor_config.json")
-    stated = stated.get("image_processor", stated)
+    usual = CLIP_MEAN_STD if config.model_type == "clip" else SIGLIP_MEAN_STD
+    stated, mean, std = read_image_processor(Path(folder), *usual)
     number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
         raise OgPointcloudError(
             f"{folder}: of its image processor, resample is {number!r:.20}, rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
-    mean, std = CLIP_MEAN_STD if config.model_type == "clip" else SIGLIP_MEAN_STD
-    mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
-    return Preprocessing(config.vision_config.image_size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number])
+    return Preprocessing(config.vision_config.image_size, mean, std, PILLOW_RESAMPLE[number])
 
 
 def published_name(folder: StrPath) -> str:

@@ -85,19 +85,15 @@ def _open_model(name: StrPath) -> ImageModel:
     if folder := encoder_folder(name):
         if ENCODER.feature_space(folder) is not None:
             return OnnxModel(folder)
-        return _transformers_model(folder, None if Path(name).expanduser().exists() else str(name))
+        from og_pointcloud.masking.clip import TransformersModel  # torch
+
+        return TransformersModel(folder, None if Path(name).expanduser().exists() else str(name))
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
         f"no encoder '{name}': it is not a folder, no encoder of that feature space is in {MODELS_VARIABLE} "
         f"({named or 'not set'}) or the cache, and it has not been fetched; expected 'demo', a model folder, or "
         f"OWNER/MODEL: fetch it first (hf download {name}), or give its folder"
     )
-
-
-def _transformers_model(folder: Path, feature_space: str | None = None) -> ImageModel:
-    from og_pointcloud.masking.clip import TransformersModel  # torch
-
-    return TransformersModel(folder, feature_space)
 
 
 class CropEncoder(MaskEncoder):

@@ -24,7 +24,6 @@ from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.scene import DoubleArray, FloatArray, IntArray
 
 Labels = IntArray
-Pairs = tuple[Labels, Labels, DoubleArray]
 
 WORKING_SIDE_PX = 480
 """Longer side at which regions are found; a larger one finds texture, not things."""
@@ -217,7 +216,7 @@ def _sums(labels: NDArray[np.integer], values: DoubleArray) -> DoubleArray:
     return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1).astype(np.float64)
 
 
-def _pixel_pairs(labels: Labels, lab: FloatArray) -> Pairs:
+def _pixel_pairs(labels: Labels, lab: FloatArray) -> tuple[Labels, Labels, DoubleArray]:
     """For the p pixels whose right neighbor is in another region: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)

@@ -10,8 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from og_pointcloud.errors import SceneError, first_line, naming_extra
 from og_pointcloud.formats.poses import read_json_object
+from og_pointcloud.masking.crops import Color
 
 with naming_extra("torch and transformers", "masks"):
     import torch
@@ -55,6 +58,24 @@ def read_config(folder: Path, *names: str) -> dict[str, Any]:
     """The first of these JSON files that a folder has, empty if it has none. SceneError if it holds no object."""
     file = next((folder / name for name in names if (folder / name).is_file()), None)
     return {} if file is None else read_json_object(file)
+
+
+def read_image_processor(folder: Path, mean: Color, std: Color) -> tuple[dict[str, Any], Color, Color]:
+    """What a folder states of its image processor, and mean and standard deviation of RGB in [0, 1]. mean, std: of the
+    published models, where the folder states none. SceneError where it states something else."""
+    stated = read_config(folder, "preprocessor_config.json", "processor_config.json")
+    stated = stated.get("image_processor", stated)
+    try:
+        colors = np.array([stated.get("image_mean", mean), stated.get("image_std", std)], np.float64)
+    except (AttributeError, TypeError, ValueError):
+        colors = np.empty(0)
+    if colors.shape != (2, 3) or not (np.isfinite(colors).all() and (colors[1] > 0).all()):
+        raise SceneError(
+            f"{folder}: image_mean or image_std of its image processor cannot be used; expected three finite numbers "
+            "each, deviations above 0: fetch the model again"
+        )
+    found: Any = map(tuple, colors.tolist())
+    return stated, *found
 
 
 def _model_type(folder: Path, classes: Mapping[str, str]) -> str:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_config, torch
+from og_pointcloud.masking.crops import Color
+from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_image_processor, torch
 from og_pointcloud.models import model_folder
 
 CLASSES = {
@@ -43,8 +44,8 @@ class Preparation:
 
     side: int
     padded: bool
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
+    mean: Color
+    std: Color
 
 
 @dataclass(frozen=True)
@@ -140,8 +141,6 @@ def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
     the published models were trained with."""
     sized = config.vision_config if kind in PADDED_MODELS else getattr(config, "prompt_encoder_config", config)
     side = sized.image_size[0] if isinstance(sized.image_size, (list, tuple)) else sized.image_size
-    stated = read_config(folder, "preprocessor_config.json", "processor_config.json")
-    stated = stated.get("image_processor", stated)
-    mean, std = HALF_MEAN_STD if kind.startswith("sam3") else IMAGENET_MEAN_STD
-    mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
-    return Preparation(int(side), kind in PADDED_MODELS, tuple(map(float, mean)), tuple(map(float, std)))
+    usual = HALF_MEAN_STD if kind.startswith("sam3") else IMAGENET_MEAN_STD
+    _, mean, std = read_image_processor(folder, *usual)
+    return Preparation(int(side), kind in PADDED_MODELS, mean, std)
