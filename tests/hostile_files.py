@@ -181,8 +181,8 @@ def tokenizer_with(**parts: Any) -> dict:
             "decoder": None, "model": {"type": "Unigram", "unk_id": 0, "vocab": pieces}} | parts  # fmt: skip
 
 
-def doubling(times: int) -> dict:
-    step = {"type": "Replace", "pattern": {"String": "a"}, "content": "aa"}
+def replacing_text(found: str, content: str, times: int) -> dict:
+    step = {"type": "Replace", "pattern": {"String": found}, "content": content}
     return tokenizer_with(normalizer={"type": "Sequence", "normalizers": [step] * times})
 
 
@@ -192,7 +192,28 @@ def charsmap(longest: int) -> dict:
 
 
 UNBOUNDED_TOKENIZERS = {
-    "doubles the text 40 times": (doubling(40), "1.1e+12 times as long"),
+    "doubles the text 40 times": (replacing_text("a", "aa", 40), "1.1e+12 times as long"),
+    "puts a letter between any two 40 times": (replacing_text("", "a", 40), "1.1e+12 times as long"),
+    "spells bytes of bytes of bytes": (
+        tokenizer_with(
+            pre_tokenizer={
+                "type": "Sequence",
+                "pretokenizers": [{"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True}] * 40,
+            }
+        ),
+        "1.21e+24 times as long",
+    ),
+    "ends each text with a million tokens": (
+        tokenizer_with(
+            post_processor={
+                "type": "TemplateProcessing",
+                "pair": [],
+                "single": [{"SpecialToken": {"id": "a", "type_id": 0}}] * 1000,
+                "special_tokens": {"a": {"id": "a", "ids": [1] * 1000, "tokens": ["a"] * 1000}},
+            }
+        ),
+        "characters of post-processing",
+    ),
     "has a long replacement": (charsmap(5000), "5e+03 times as long"),
     "has a long piece": (
         tokenizer_with(model={"type": "Unigram", "unk_id": 0, "vocab": [["<unk>", 0.0], ["a" * 30_000, -1.0]]}),

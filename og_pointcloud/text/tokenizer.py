@@ -39,13 +39,15 @@ MAX_CHARACTERS = 4096
 """Longer texts are truncated first of all; contexts have 77 tokens or fewer."""
 MAX_PIECE_CHARACTERS, MAX_ADDED_PIECES = 256, 1 << 12
 """Characters of a piece, and pieces added to the vocabulary. Unigrams take time quadratic in a piece's length."""
+MAX_FRAME_CHARACTERS = 1 << 13
+"""Characters of the description of what is put around a text's ids: templates repeat lists of ids."""
 MAX_GROWTH = 256
-"""Largest factor by which a normalizer may lengthen a text."""
+"""Largest factor by which normalizer and pre-tokenizer may lengthen a text."""
 GROWTH = {
     "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Lowercase": 3, "Strip": 1, "StripAccents": 1, "Nmt": 1,
     "BertNormalizer": 4, "ByteLevel": 4, "Prepend": 2,
 }  # fmt: skip
-"""Largest factor by which each normalizer lengthens a text, by Unicode's own tables."""
+"""Largest factor by which each step lengthens a text, by Unicode's own tables."""
 MAX_CACHED_PIECES = 1 << 14
 
 
@@ -242,9 +244,15 @@ def _check_other(description: dict[str, Any]) -> None:
         if pattern not in (CLIP_WORDS, CLIP_SPECIALS + CLIP_WORDS) and not LINEAR_PATTERN.fullmatch(pattern):
             raise ValueError(f"it uses the pattern {pattern!r:.80}, which may be slow on some texts")
 
-    growth = _growth(description.get("normalizer") or {"type": "Strip"})
+    # Of pre-tokenizers only this one lengthens texts; named as often as it is used.
+    byte_levels = json.dumps(description.get("pre_tokenizer")).count('"ByteLevel"')
+    normalizer = description.get("normalizer") or {"type": "Strip"}
+    growth = math.prod([float(GROWTH["ByteLevel"])] * byte_levels, start=_growth(normalizer))
     if growth > MAX_GROWTH:
-        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MAX_GROWTH}")
+        raise ValueError(f"it makes texts {growth:.3g} times as long; expected at most {MAX_GROWTH}")
+    framing = len(json.dumps(description.get("post_processor")))
+    if framing > MAX_FRAME_CHARACTERS:
+        raise ValueError(f"it has {framing} characters of post-processing; expected at most {MAX_FRAME_CHARACTERS}")
     vocabulary, added = model["vocab"], description.get("added_tokens") or []
     pieces = vocabulary if isinstance(vocabulary, dict) else (entry[0] for entry in vocabulary)
     longest = max((len(piece) for piece in (*pieces, *(token["content"] for token in added))), default=0)
@@ -261,7 +269,9 @@ def _growth(step: dict[str, Any]) -> float:
     if kind == "Sequence":
         return math.prod(max(1.0, _growth(inner)) for inner in step["normalizers"])
     if kind == "Replace":
-        return len(step["content"]) / max(1, len(step["pattern"].get("String", "")))
+        found = step["pattern"].get("String", " ")  # LINEAR_PATTERN takes at least one character
+        # The empty text is found between any two characters, and stays there.
+        return len(step["content"]) / len(found) if found else 1.0 + len(step["content"])
     if kind == "Precompiled":
         # SentencePiece's map: the trie's length in 4 bytes, the trie, then all replacements, each ended by a zero byte.
         table = base64.b64decode(step["precompiled_charsmap"] or "")
