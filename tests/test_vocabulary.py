@@ -374,6 +374,13 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
     assert len(results[5]) == len(scene.instances)
 
 
+@pytest.mark.filterwarnings("ignore:none of")
+def test_an_encoder_carried_by_a_scene_of_an_unnamed_space_answers(encoder_folder, tmp_path):
+    path = write_bundle(replace(room(100), feature_space="unknown"), tmp_path / "s.ogpc")
+    carry_encoder(path, encoder_folder)
+    assert og.segment(path, ["cat"]).names == ("cat",)
+
+
 def test_a_scene_outlives_its_file(path, encoder_folder):
     scene = og.load(path)
     expected = og.segment(scene, ["apple"]).labels

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import WordBank
+from og_pointcloud.cloud import FeatureSpace, WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.npy import array_from_npy
@@ -165,7 +165,7 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     or contain encoders. None if there is none; OgPointcloudError if there is one that cannot be used.
     """
     if carried is not None and (encoder := carried()):
-        if encoder.feature_space != feature_space:
+        if not FeatureSpace(feature_space, 0).accepts(FeatureSpace(encoder.feature_space, 0)):
             raise FeatureSpaceError(
                 f"{encoder.where} has feature space '{encoder.feature_space}', the scene has '{feature_space}', and "
                 "vectors of two spaces cannot be compared: store the scene's own (og-pointcloud export --help)"
