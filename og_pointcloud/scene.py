@@ -73,12 +73,12 @@ def take_arrays(record: Any, *names: str) -> None:
 
 
 def numbers_of(value: Any) -> NDArray[Any]:
-    """np.asarray that also takes torch tensors; for a value that is no array, such as rows of different lengths, a
-    scalar None, which matches no expected shape."""
+    """np.asarray that also takes torch tensors; for a value that it cannot convert, such as rows of different lengths,
+    a scalar None, which matches no expected shape."""
     of_torch = any(kind.__module__.partition(".")[0] == "torch" for kind in type(value).__mro__)
     try:
         return np.asarray(dense_tensor(value) if of_torch else value)
-    except ValueError:
+    except Exception:  # arrays of GPU libraries raise types of their own
         return np.array(None)
 
 

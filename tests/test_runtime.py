@@ -110,6 +110,27 @@ def test_what_are_no_numbers_is_refused(scene, points):
             ask(points)
 
 
+class OnGpu:
+    """Refuses numpy, as cupy's arrays do."""
+
+    def __array__(self, *_, **__):
+        raise TypeError("Implicit conversion to a NumPy array is not allowed. Please use `.get()`")
+
+
+def test_arrays_of_a_gpu_library_are_refused_in_its_own_words(scene):
+    with pytest.raises(SceneError, match=r"a OnGpu is not an array of points \(Implicit .*`.get\(\)`\); expected"):
+        og.segment(OnGpu(), ["apple"], scene)
+    for ask in (
+        lambda: scene.instances_at(OnGpu()),
+        lambda: og.segment(scene, {"apple": OnGpu()}),
+        lambda: og.segment(scene.xyz, ["apple"], scene, pose=OnGpu()),
+        lambda: og.pick(scene, OnGpu()),
+        lambda: og.oriented_box(OnGpu()),
+    ):
+        with pytest.raises(OgPointcloudError, match=" expected "):
+            ask()
+
+
 def test_many_points_are_asked_in_runs(scene, monkeypatch):
     points = queries(scene.cloud, 300).astype(np.float64)
     whole = scene.instances_at(points)

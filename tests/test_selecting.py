@@ -71,7 +71,8 @@ def test_without_rivals_only_the_best_fits():
         assert selection.to_json().count('"rival": null') == 3
     for nothing in (set(), {}, np.array([], str), iter([]), (word for word in ())):
         assert og.select(scene, "mug", against=nothing).rivals == 0
-    assert og.select(scene, "mug", against=iter(["cup"])).rivals == 1
+    for one in (iter(["cup"]), np.array("cup")):
+        assert og.select(scene, "mug", against=one).rivals == 1
     wordless = LabelledScene.from_cloud(replace(scene.cloud, vocabulary=None))
     assert og.select(wordless, {"mug": AXES[0]}).instances == (0,)
 

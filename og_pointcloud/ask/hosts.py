@@ -137,7 +137,7 @@ def _checked(values: Any, kind: str) -> NDArray[np.float64]:
         values = np.ma.filled(values.astype(np.float64), np.nan)  # masked points have no coordinates
     try:
         points = np.asarray(values)
-    except ValueError as error:
+    except Exception as error:  # arrays of GPU libraries raise types of their own
         raise SceneError(f"a {kind} is not an array of points ({error}); expected shape (N, 3)") from None
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise SceneError(

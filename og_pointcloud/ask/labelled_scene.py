@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
 from functools import cached_property, lru_cache, partial
 from numbers import Real
 from pathlib import Path
@@ -129,8 +128,6 @@ class LabelledScene:
     def words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
         """Labels with their vectors, found as for ``segment``: given, from a file, the scene's own, or encoded."""
         encoder = carried_encoder(self.path)
-        if isinstance(labels, Mapping):
-            labels = {name: numbers_of(vector) for name, vector in labels.items()}
         return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder)
 
     def known_words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:

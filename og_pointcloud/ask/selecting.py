@@ -177,7 +177,9 @@ def _match(
 
 def _rivals(scene: LabelledScene, query: Vocabulary, against: Labels, text_features: TextFeatures) -> Vocabulary:
     """The words that compete with the query, without itself."""
-    if isinstance(against, Iterable) and not isinstance(against, Sized):  # an iterator can be counted only once
+    if isinstance(against, np.ndarray):
+        against = np.atleast_1d(against)  # an array without dimensions is one word
+    elif isinstance(against, Iterable) and not isinstance(against, Sized):  # an iterator can be counted only once
         against = list(against)
     none_wanted = isinstance(against, Sized) and not len(against)  # []; None asks for all known words
     words = query if none_wanted else scene.known_words(against, text_features)

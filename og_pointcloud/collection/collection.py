@@ -169,10 +169,7 @@ class Collection:
         names = _texts("words", words, "at least one word or phrase")
         patterns = None if scenes is None else _texts("scenes", scenes, "at least one name or pattern, or None for all")
         features = None if text_features is None else words_of(text_features)
-        given = None
-        if isinstance(words, Mapping):
-            arrays = {name: numbers_of(vector) for name, vector in words.items()}
-            given = resolve_labels(arrays, None, None, UNKNOWN_SPACE)
+        given = resolve_labels(words, None, None, UNKNOWN_SPACE) if isinstance(words, Mapping) else None
         box = None if within is None else _corners(within)
         query = _Query(names, features, given, patterns, box, top)
         self._open()

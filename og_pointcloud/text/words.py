@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, did_you_mean, printable
 from og_pointcloud.formats.atomic import StrPath
+from og_pointcloud.scene import numbers_of
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
@@ -105,7 +106,7 @@ def words_of(text_features: StrPath | tuple[Vocabulary, str]) -> tuple[Vocabular
 def _stacked(names: Iterable[str], vectors: Iterable[Any]) -> NDArray[Any]:
     rows = []
     for name, vector in zip(names, vectors, strict=True):
-        row = np.asarray(vector)
+        row = numbers_of(vector)
         if row.ndim != 1 or row.dtype.kind not in "fiu" or row.shape != (rows[0] if rows else row).shape:
             raise FeatureSpaceError(
                 f"the vector of '{name}' is {row.dtype} {row.shape}; expected numbers of shape "
