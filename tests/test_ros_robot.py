@@ -12,12 +12,13 @@ pytest.importorskip("open3d")
 pytest.importorskip("rosbags")
 pytest.importorskip("matplotlib")
 
+from labelled_clouds import instance_table, make_cloud
 from og_pointcloud_export import write_bundle
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.robot import BACKGROUND, MOVED, NEW, NO_RETURN, Drive, Lidar
 from og_pointcloud_room.room import furnish
 
-from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.cloud import Vocabulary
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "07_robot.py"
 SPACING = 0.06
@@ -95,12 +96,9 @@ def true_scene(tmp_path_factory):
     ids = np.repeat(np.array(owners, np.int32), [len(part) for part in points])
     vectors = np.linalg.qr(rng.normal(size=(32, 32)))[0][: len(CLASS_NAMES)].astype(np.float32)
     classes = [CLASS_NAMES.index(item.name) for item in room.objects]
-    numbers, ratios = np.full(count, 9, np.int32), np.ones(count, np.float32)
-    table = InstanceTable(vectors[classes], np.arange(count, dtype=np.int32), numbers, numbers, numbers, ratios, ratios)
-    cloud = LabelledCloud(
-        np.concatenate(points).astype(np.float32), np.zeros(3), ids, table, "room", SPACING, 2 * SPACING,
-        vocabulary=Vocabulary(CLASS_NAMES, vectors),
-    )  # fmt: skip
+    table = replace(instance_table(count), descriptors=vectors[classes])
+    cloud = make_cloud(np.concatenate(points), ids, SPACING, 2 * SPACING, instances=table)
+    cloud = replace(cloud, vocabulary=Vocabulary(CLASS_NAMES, vectors))
     return write_bundle(cloud, tmp_path_factory.mktemp("room") / "room.ogpc")
 
 

@@ -21,7 +21,9 @@ from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import joined
 from og_pointcloud.mapping.presence import Evidence, Visit
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, NOTHING, THROUGH, DiscSurface, states_of_points, view_of_depth
+from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.scene import Camera
+from og_pointcloud.settings import GeometrySettings
 
 AWAY = (-0.9, 0.5, 0.0)
 BEFORE = [CHEST, BIN, CRATE]
@@ -120,10 +122,15 @@ def test_states_of_points_follow_the_rule_word_by_word(noise):
         assert np.count_nonzero(fast != literal) <= 2  # of which a distance lies on the tolerance, in float32
 
 
+def discs(xyz):
+    xyz = xyz.astype(np.float32)
+    return DiscSurface(xyz, neighborhood(xyz, GeometrySettings()))
+
+
 def test_a_cloud_is_seen_like_its_depth_image():
     camera = cameras()[2]
     xyz, _ = surface(AFTER, seed=4)
-    drawn = DiscSurface(xyz.astype(np.float32)).seen_from(camera)
+    drawn = discs(xyz).seen_from(camera)
     depth, _ = cast(AFTER, drawn.camera)
     both = (drawn.depth > 0) & (depth > 0)
     assert both.sum() > 0.95 * (depth > 0).sum()
@@ -202,7 +209,7 @@ def test_two_sheets_are_no_thick_one(apart):
     random, count = np.random.default_rng(0), 2000
     height = np.repeat([0.0, apart / np.sqrt(count)], count)
     sheets = np.c_[random.random((2 * count, 2)), height]
-    found = DiscSurface(sheets.astype(np.float32))
+    found = discs(sheets)
     assert found.scatter < 0.1 * found.spacing
     assert np.mean(np.abs(found.xyz[:, 2] - sheets[:, 2]) < 0.1 * found.spacing) > 0.85
 

@@ -81,9 +81,7 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     stays, orphaned = _staying(earlier, found)
     ids_of_later = _ids_of_later(earlier, later, stays, found)
     # Only those points of the visit are added that lie where the map has none (left): visits do not densify the map.
-    adds: NDArray[np.bool_] = np.ones(len(b), bool)
-    if stays.any():
-        adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_POINT_SPACINGS * a.spacing
+    adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_POINT_SPACINGS * a.spacing
     states = np.append(ids_of_later, [UNOBSERVED, BACKGROUND])  # -2 and -1 index the last two
     ids = np.concatenate([_relabelled(a, b, orphaned, states)[stays], states[b.instance_ids[adds]]]).astype(np.int32)
     changes = replace(found.changes, new=tuple(sorted({int(ids_of_later[k]) for k in found.changes.new})))

@@ -28,9 +28,8 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping.voxels import in_camera, turned
-from og_pointcloud.rendering.geometry import Neighborhood, depths, neighborhood
+from og_pointcloud.rendering.geometry import Neighborhood, depths
 from og_pointcloud.scene import Camera
-from og_pointcloud.settings import GeometrySettings
 
 NOTHING, AGREES, HIDDEN, THROUGH = 0, 1, 2, 3
 """States of a point."""
@@ -95,8 +94,7 @@ class DiscSurface:
     moved. noise: standard deviation of the planes themselves.
     """
 
-    def __init__(self, xyz: NDArray[np.float32], around: Neighborhood | None = None) -> None:
-        around = neighborhood(xyz, GeometrySettings()) if around is None else around
+    def __init__(self, xyz: NDArray[np.float32], around: Neighborhood) -> None:
         self.spacing = float(np.median(around.spacing))
         self.normal, height, off = _planes(xyz, around.index[:, :PLANE_POINTS])
         noise = self.scatter = float(np.median(off))

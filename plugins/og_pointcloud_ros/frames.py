@@ -103,16 +103,16 @@ class FrameAssembler:
         pose: (frame id, stamp) -> (4, 4) from that frame to the map; its errors propagate. SceneError without a camera.
         """
         parts = self.waiting[stamp]
-        has_masks = parts.masks is not None and parts.features is not None
-        if parts.depth is None and not has_masks:
+        masks = features = None
+        if parts.masks is not None and parts.features is not None:
+            # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
+            masks, features = parts.masks.astype(np.int64) - 1, parts.features
+        if parts.depth is None and masks is None:
             return None
         if self._info is None:
             raise SceneError("no camera_info came with it")
         camera = _camera(self._info, self.rectified, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
         depth = None if parts.depth is None else lengths(parts.depth)
-        # Mask i + 1 is row i of the features; 0, no mask, becomes -1.
-        masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
-        features = parts.features if has_masks else None
         return Frame(camera, masks, features, depth, rgb=self._rgb(parts.color, camera), stamp=stamp / NANOSECONDS)
 
     def _rgb(self, color: NDArray[Any] | None, camera: Camera) -> NDArray[np.uint8] | None:
