@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from og_pointcloud.errors import OgPointcloudError
 
 ABOVE_ZERO = {
-    "coarse_interval", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
+    "coarse_interval", "enough_views", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
     "kinds", "lloyd_rounds", "memory", "neighbors", "opacity", "reach", "rounds", "scale", "scales", "schedule_share",
     "sharpness", "synonym", "tile_points", "width",
 }  # fmt: skip
@@ -82,7 +82,7 @@ class GeometrySettings(_Checked):
     @property
     def middle_scale(self) -> float:
         """The scale where views cannot be held out: there are fewer than eight, or they share nothing."""
-        return self.scales[len(self.scales) // 2]
+        return sorted(self.scales)[len(self.scales) // 2]
 
 
 @dataclass(frozen=True)

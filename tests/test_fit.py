@@ -360,6 +360,7 @@ def test_pixels_beyond_those_that_mode_paper_renders_are_left_out() -> None:
         (lambda: GeometrySettings(reach=float("inf")), "reach is inf; expected a finite number above 0, by default 3"),
         (lambda: GeometrySettings(scales=()), r"scales is \(\); expected a tuple of numbers above 0"),
         (lambda: GeometrySettings(opacity=1.5), "opacity is 1.5; expected a finite number above 0 and at most 1"),
+        (lambda: GeometrySettings(enough_views=0), "enough_views is 0; expected a whole number above 0"),
         (lambda: GroupingSettings(graph_points=0.5), "graph_points is 0.5; expected a whole number above 0"),  # type: ignore[arg-type]
         (lambda: FitSettings(mode="quick"), "mode is 'quick'; expected one of 'grouping', 'fast', 'paper', 'auto'"),  # type: ignore[arg-type]
         (lambda: FitSettings(memory="4GB"), "memory is '4GB'; expected a whole number above 0"),  # type: ignore[arg-type]

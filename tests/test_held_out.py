@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 import og_pointcloud as og
 from og_pointcloud.fitting import held_out
-from og_pointcloud.fitting.held_out import MIN_AGREEMENT_GAIN, SCALE_STEP, agreement, choose_scale, search
+from og_pointcloud.fitting.held_out import MIN_AGREEMENT_GAIN, SCALE_STEP, ScaleChoice, agreement, choose_scale, search
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import near_plane, neighborhood
@@ -105,14 +105,16 @@ def test_masks_are_read_once_for_all_sizes_where_memory_allows(scene: Scene, mon
 
 
 def test_too_few_views_to_hold_some_out(scene: Scene) -> None:
-    choice = chosen(replace(scene, views=scene.views[:7]))
-    assert (choice.scale, choice.agreements) == (FitSettings().geometry.middle_scale, {})
-    cloud = og.fit(replace(scene, views=scene.views[:7]), progress=False)
+    few, shuffled = replace(scene, views=scene.views[:7]), GeometrySettings(scales=(0.7, 0.35, 0.5))
+    assert chosen(few, FitSettings(geometry=shuffled)).scale == 0.5  # the middle one
+    assert chosen(few) == ScaleChoice(FitSettings().geometry.middle_scale, {})
+    cloud = og.fit(few, progress=False)
     assert any(entry["key"] == "choice of scale" for entry in cloud.provenance["left_out"])
 
 
-def test_a_size_that_is_given_is_taken(scene: Scene) -> None:
-    assert chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.3,)))).scale == 0.3
+@pytest.mark.parametrize("scales", [(0.3,), (0.3, 0.3)])
+def test_a_size_that_is_given_is_taken(scene: Scene, scales: tuple[float, ...]) -> None:
+    assert chosen(scene, FitSettings(geometry=GeometrySettings(scales=scales))).scale == 0.3
 
 
 def test_agreement_by_hand() -> None:

@@ -46,7 +46,7 @@ from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint, kept_file
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
-from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
+from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings
 
 MATRICES = ("weights", "outside", "exposure")
 TIGHT = FitSettings(memory=1)
@@ -457,25 +457,6 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
     monkeypatch.setattr(votes_module, "ENTRIES_AT_ONCE", 40)
     few = assign_points(*arguments)
     np.testing.assert_equal(asdict(few), asdict(at_once))
-
-
-@pytest.mark.slow
-def test_a_fit_goes_on_from_its_work_folder_and_removes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = boxes_on_a_table().scene
-    settings = FitSettings(visibility=VisibilitySettings(keep_after_s=0))
-    with killed_run(tmp_path / "work") as work:
-        prepare(scene, settings, work=work)
-    assert kept_files(tmp_path / "work", "view") == len(scene.views)
-    counts = rendered(monkeypatch)
-    cloud = fit(scene, settings, progress=False, work=tmp_path / "work")
-    assert counts == []
-    assert {
-        name: value
-        for name, value in next(e for e in cloud.provenance["left_out"] if e["key"] == "rendering").items()
-        if name in ("key", "count")
-    } == {"key": "rendering", "count": 8}
-    np.testing.assert_array_equal(cloud.instance_ids, fit(scene, progress=False).instance_ids)
-    assert not (tmp_path / "work").exists()
 
 
 SLOW_FIT = """

@@ -363,14 +363,8 @@ def test_the_command_fits_in_tiles(tiny_capture: TinyCapture, tmp_path):
     assert not list(tmp_path.glob("*.work"))
 
 
-@pytest.mark.parametrize(
-    "executor",
-    [
-        pytest.param("threads", marks=pytest.mark.slow),
-        pytest.param("processes", marks=pytest.mark.slow),
-        pytest.param("dask", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["threads", "processes", "dask"])
 def test_tiles_are_the_same_on_any_executor(executor, tmp_path, recwarn):
     reference = tiled(POINTS // 4)
     with executor_of(executor) as workers:

@@ -63,7 +63,7 @@ def choose_scale(
     views and points are used (see settings), but all points occlude. The order of views and points does not matter.
     """
     geometry = settings.geometry
-    if len(geometry.scales) == 1:
+    if len({*geometry.scales}) == 1:
         return ScaleChoice(geometry.scales[0], {})
     # By name, so that a capture's views give the same halves in any order; frames of a video then alternate.
     masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)

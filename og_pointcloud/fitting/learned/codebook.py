@@ -8,6 +8,7 @@ Gaussian by how much of it shows makes the right side small, without pixels or g
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,14 +206,13 @@ def _clusters(
     if k <= 1 or len(values) == 0:
         return np.zeros(len(values), np.int32), min(1, len(values))
     # Starts are compared on a subsample; only the best one's centers are then refined on all points.
-    sample = slice(None, None, -(-len(values) // SEED_POINTS))
-    least, best = np.inf, values[:0]
+    step = -(-len(values) // SEED_POINTS)
+    some, mass = values[::step], weight[::step]
+    starts = []
     for _ in range(STARTS):
-        start = seed_centers(values[sample], weight[sample], k, rng)
-        own, centers = kmeans(values[sample], weight[sample], start, rounds)
-        spread = float(weight[sample] @ ((values[sample] - centers[own]) ** 2).sum(axis=1))
-        if spread < least:
-            least, best = spread, centers
+        own, centers = kmeans(some, mass, seed_centers(some, mass, k, rng), rounds)
+        starts.append((float(mass @ ((some - centers[own]) ** 2).sum(axis=1)), centers))
+    _, best = min(starts, key=itemgetter(0))
     own, _ = kmeans(values, weight, best, rounds)
     used, own = np.unique(own, return_inverse=True)
     return own.astype(np.int32), len(used)
