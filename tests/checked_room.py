@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
-import cv2
 import numpy as np
 from pinhole import looking, rays
 
@@ -50,31 +47,6 @@ def with_views(scene, **parts):
         for index, view in enumerate(scene.views)
     )
     return replace(scene, views=tuple(changed))
-
-
-def write_room(folder: Path, scene: Scene) -> Path:
-    """The scene as a capture folder: nerfstudio's poses."""
-    for name in ("images", "masks"):
-        (folder / name).mkdir(parents=True)
-    frames = []
-    for view in scene.views:
-        camera_to_world = np.linalg.inv(in_local_frame(view.camera, -scene.points.origin).world_to_camera)
-        frames.append(
-            {
-                "file_path": f"images/{view.name}.png",
-                "transform_matrix": (camera_to_world @ np.diag([1, -1, -1, 1.0])).tolist(),
-            }
-        )
-        cv2.imwrite(str(folder / "images" / f"{view.name}.png"), view.image_rgb()[..., ::-1])
-        cv2.imwrite(str(folder / "masks" / f"{view.name}.png"), (view.mask_map() + 1).astype(np.uint16))
-    intrinsics = {"fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": CENTER[0], "cy": CENTER[1], "w": WIDTH, "h": HEIGHT}
-    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
-    features = {view.name: view.mask_features for view in scene.views}
-    np.savez(folder / "mask_features.npz", feature_space=np.array(scene.feature_space), **features)
-    from og_pointcloud.formats.ply import plain_rows, write_ply
-
-    write_ply(folder / "points.ply", {"vertex": plain_rows(scene.points.xyz_world, scene.points.rgb)})
-    return folder
 
 
 def _surface(random, count):

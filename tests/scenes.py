@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pinhole import looking, rays
 
 from og_pointcloud.formats.depth import DepthFile, DepthFrame
-from og_pointcloud.scene import Camera
+from og_pointcloud.formats.poses import rigid
+from og_pointcloud.scene import Camera, Points, Scene, View
 
 NAMES = ("red ball", "blue ball")
 UNUSED_NAME = "lamp"
@@ -54,35 +55,45 @@ class TinyCapture:
 
 def write_tiny_capture(folder: Path, view_count: int = 6) -> TinyCapture:
     random = np.random.default_rng(0)
-    for name in ("images", "masks"):
-        (folder / name).mkdir(parents=True)
     xyz, object_ids = sample_surfaces()
-    write_ply(folder / "points.ply", xyz, COLORS[object_ids])
-
     vectors = np.linalg.qr(random.normal(size=(FEATURE_WIDTH, FEATURE_WIDTH)))[0].astype(np.float32)[:3]
-    frames, features = [], {}
+    views = []
     for index in range(view_count):
-        stem = f"view{index}"
         angle = 2 * np.pi * (index + 0.25) / view_count
         eye = 2.6 * np.array([np.cos(angle), np.sin(angle), 0.6])
         seen_by = Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2, looking(eye, [0, 0, 0.4] - eye))
         object_map = ray_cast(seen_by)
-        camera_to_world = np.linalg.inv(seen_by.world_to_camera) @ np.diag([1, -1, -1, 1])  # OpenGL axes
         order = random.permutation(len(NAMES))  # mask ids mean nothing across views
-        mask = np.append(order + 1, 0)[object_map].astype(np.uint16)
-        cv2.imwrite(str(folder / "masks" / f"{stem}.png"), mask)
-        cv2.imwrite(str(folder / "images" / f"{stem}.png"), COLORS[object_map][..., ::-1])
         rows = np.argsort(order)
-        features[stem] = vectors[rows] + 0.05 * random.normal(size=(len(rows), FEATURE_WIDTH)).astype(np.float32)
-        frames.append({"file_path": f"images/{stem}.png", "transform_matrix": camera_to_world.tolist()})
-
-    intrinsics = {"fl_x": FOCAL_PX, "fl_y": FOCAL_PX, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
-    transforms = {**intrinsics, "ply_file_path": "points.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(transforms))
-    np.savez(folder / "mask_features.npz", feature_space=np.array(FEATURE_SPACE), **features)
+        features = vectors[rows] + 0.05 * random.normal(size=(len(rows), FEATURE_WIDTH)).astype(np.float32)
+        masks = np.append(order, -1)[object_map].astype(np.int32)
+        views.append(View(f"view{index}", seen_by, masks, features, COLORS[object_map]))
+    write_scene(folder, Scene(Points(xyz, np.zeros(3), COLORS[object_ids]), tuple(views), FEATURE_SPACE))
     names = np.array([*NAMES, UNUSED_NAME])
     np.savez(folder / "text_features.npz", names=names, vectors=vectors, feature_space=np.array(FEATURE_SPACE))
     return TinyCapture(folder, object_ids)
+
+
+def write_scene(folder: Path, scene: Scene) -> Path:
+    """The scene as a capture folder: nerfstudio's poses, in the world; all views have the first one's intrinsics."""
+    frames = []
+    for view in scene.views:
+        center, rotation = view.camera.center + scene.points.origin, view.camera.world_to_camera[:3, :3].T
+        camera_to_world = rigid(rotation @ np.diag([1.0, -1, -1]), center)  # OpenGL axes
+        frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": camera_to_world.tolist()})
+        write_image(folder / "masks" / f"{view.name}.png", (view.mask_map() + 1).astype(np.uint16))
+        image = view.image_rgb()
+        if image is not None:
+            write_image(folder / "images" / f"{view.name}.png", image[..., ::-1])
+    one = scene.views[0].camera
+    intrinsics = {"fl_x": one.fx, "fl_y": one.fy, "cx": one.cx, "cy": one.cy, "w": one.width, "h": one.height}
+    transforms = {**intrinsics, "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    features = {view.name: view.mask_features for view in scene.views}
+    np.savez(folder / "mask_features.npz", allow_pickle=False, feature_space=np.array(scene.feature_space), **features)
+    points = scene.points
+    write_ply(folder / "points.ply", points.xyz_world if points.origin.any() else points.xyz, points.rgb)
+    return folder
 
 
 def sample_surfaces(per_ball: int = 500, floor_side: int = 24) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -111,15 +122,15 @@ def ray_cast(camera: Camera, centers: NDArray[np.float64] = CENTERS, radius: flo
     return seen
 
 
-def write_ply(path: Path, xyz: NDArray[np.floating], rgb: NDArray[np.uint8]) -> None:
+def write_ply(path: Path, xyz: NDArray[np.floating], rgb: NDArray[np.uint8] | None) -> None:
     """A binary little-endian cloud, float or double as the positions are; written here so that the project's own writer
     is not what its reader is held to."""
     kind = "double" if xyz.dtype == np.float64 else "float"
     lines = [f"property {kind} {axis}" for axis in "xyz"]
-    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    lines += [f"property uchar {color}" for color in ("red", "green", "blue") if rgb is not None]
     header = "\n".join(["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}", *lines, "end_header\n"])
-    rows = np.zeros(len(xyz), [("xyz", xyz.dtype.newbyteorder("<"), 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = xyz, rgb
+    rows = np.zeros(len(xyz), [("xyz", xyz.dtype.newbyteorder("<"), 3), ("rgb", "u1", (0 if rgb is None else 3,))])
+    rows["xyz"], rows["rgb"] = xyz, np.zeros((len(xyz), 0)) if rgb is None else rgb
     path.write_bytes(header.encode() + rows.tobytes())
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from checked_room import tiled_room, with_cameras, with_views, write_room
+from checked_room import tiled_room, with_cameras, with_views
 from commands import error_of, output_of
+from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
 import og_pointcloud as og
@@ -100,8 +101,11 @@ def test_of_images_cut_into_faces_the_fronts_are_asked_where_there_are_enough(co
 
 @pytest.mark.parametrize("seed", [0, *for_release(1, 2, 3)])
 def test_a_right_room_is_silent_and_every_check_is_made(seed):
-    expected = dict.fromkeys(("poses", "alignment", "masks", "features"), "ok")
-    assert verdicts(check_capture(tiled_room(seed))) == expected
+    checks = check_capture(tiled_room(seed))
+    assert verdicts(checks) == dict.fromkeys(("poses", "alignment", "masks", "features"), "ok")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CaptureWarning)
+        warn_of_doubts(checks)
 
 
 @pytest.mark.parametrize("options", [{"origin": (5e5, 4e6, 0), "scale": 100.0}, {"views": 3}, {"points": 1500}])
@@ -439,12 +443,6 @@ def test_words_of_another_encoder_are_told(fitted):
     assert check_words(other).verdict == "doubt"
 
 
-def test_nothing_is_warned_of_a_right_room():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CaptureWarning)
-        warn_of_doubts(check_capture(tiled_room(0)))
-
-
 # Repairs.
 
 
@@ -560,7 +558,7 @@ def test_points_behind_others_are_not_seen():
 
 
 def test_the_commands_tell_a_fault_repair_it_and_take_the_repair_back(tmp_path, capsys):
-    folder = write_room(tmp_path / "room", faulty("axes=flipped", **SMALL))
+    folder = write_scene(tmp_path / "room", faulty("axes=flipped", **SMALL))
     fit = ["fit", str(folder), "-o", str(tmp_path / "room.ogpc"), "--json", str(tmp_path / "room.json")]
     assert main(fit) == 0
     said = capsys.readouterr()
@@ -586,8 +584,8 @@ def test_the_commands_tell_a_fault_repair_it_and_take_the_repair_back(tmp_path, 
 
 def test_a_repaired_capture_is_the_right_one(tmp_path):
     scene = tiled_room(1, views=4, points=500)
-    right = og.read_capture(write_room(tmp_path / "right", scene))
-    wrong = write_room(tmp_path / "wrong", faulty("axes=flipped scale=0.5", views=4, points=500))
+    right = og.read_capture(write_scene(tmp_path / "right", scene))
+    wrong = write_scene(tmp_path / "wrong", faulty("axes=flipped scale=0.5", views=4, points=500))
     repaired = og.read_capture(wrong, repairs=["scale=2", "axes=flipped"])
     for one, other in zip(right.views, repaired.views, strict=True):
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-5)
@@ -597,9 +595,9 @@ def test_a_repaired_capture_is_the_right_one(tmp_path):
 
 def test_pick_and_masks_warn_of_poses_that_do_not_fit(tmp_path, capsys):
     scene = tiled_room(1, **SMALL)
-    right = write_room(tmp_path / "right", scene)
+    right = write_scene(tmp_path / "right", scene)
     assert main(["fit", str(right), "-o", str(tmp_path / "room.ogpc")]) == 0
-    wrong = write_room(tmp_path / "wrong", faulty("axes=flipped", **SMALL))
+    wrong = write_scene(tmp_path / "wrong", faulty("axes=flipped", **SMALL))
     capsys.readouterr()
     pick = ["pick", str(tmp_path / "room.ogpc"), "--view", "view00", "--pixel", "40,30", "--capture"]
     assert main([*pick, str(right)]) == 0

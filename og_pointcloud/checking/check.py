@@ -16,7 +16,7 @@ import numpy as np
 
 from og_pointcloud.checking.conversions import Repairs, best_conversion, best_mask_conversion
 from og_pointcloud.checking.masks import MaskMaps, read_mask_maps
-from og_pointcloud.checking.photographs import SAME_CONTENT_CORRELATION, Photographs, read_photographs, unreadable
+from og_pointcloud.checking.photographs import SAME_CONTENT_CORRELATION, Photographs, read_photographs
 from og_pointcloud.checking.registration import GROUPS, MORE_POINTS_PER_VIEW, Registration, SmallChange
 from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
@@ -96,13 +96,14 @@ def check_capture(scene: Scene) -> list[Check]:
     """
     sample = draw_sample(scene)
     maps = read_mask_maps(sample) if any(view.mask_count for view in scene.views) else None
+    photographs, errors = read_photographs(sample)
     # In this order, as one fault looks like the next: wrong poses make masks disagree, wrong masks swap features.
-    checks, photographs = _poses(sample, maps)
+    checks, photographs = _poses(sample, maps, photographs)
     checks.append(_alignment(photographs))
     if maps is not None:
         checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
         checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
-    return [*_coordinates(scene.points), *checks, *_unreadable(sample, photographs)]
+    return [*_coordinates(scene.points), *checks, *_unreadable(sample, errors)]
 
 
 def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
@@ -166,20 +167,19 @@ def _coordinates(points: Points) -> list[Check]:
     return [Check("coordinates", "doubt", says)]
 
 
-def _unreadable(sample: Sample, photographs: Photographs | None) -> list[Check]:
+def _unreadable(sample: Sample, errors: list[str]) -> list[Check]:
     """A doubt where photographs cannot be read: the fit goes on without them, as if the capture had none."""
-    used = {view.name for view in photographs.sample.views} if photographs else set()
-    given = [view for view in sample.views if view.image is not None and sample.rgb is not None]
-    found = unreadable(view for view in given if view.name not in used)
-    if not found:
+    if not errors:
         return []
-    says = f"{len(found)} of {len(given)} that were sampled cannot be read, and are not used: {found[0]}"
+    given = sum(view.image is not None for view in sample.views)
+    says = f"{len(errors)} of {given} that were sampled cannot be read, and are not used: {errors[0]}"
     return [Check("photographs", "doubt", says)]
 
 
-def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:
+def _poses(
+    sample: Sample, maps: MaskMaps | None, photographs: Photographs | None
+) -> tuple[list[Check], Photographs | None]:
     """The check of poses, by photographs where there are any, else by masks; and the photographs, if they fit."""
-    photographs = read_photographs(sample)
     if photographs is None:
         return [_poses_by_masks(sample, maps)], None
     stated = photographs.fit(photographs.sample.cameras)

@@ -7,7 +7,7 @@ exposure, noise and hidden points change little. Nothing else of the capture is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,30 +74,28 @@ class Photographs:
         return _tint(rgb) < MAX_GRAY_TINT <= float(np.median([_tint(grid[0]) for grid in self.grids]))
 
 
-def read_photographs(sample: Sample) -> Photographs | None:
-    """None where there is nothing to compare: no photographs, no colors, or a few photographs of the same."""
-    if sample.rgb is None or float(sample.rgb.std(axis=0).max()) < MIN_COLOR_DEVIATION:
-        return None
-    readable = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
-    images = list(readable.values())
-    sample = sample.of_views(list(readable))
+def read_photographs(sample: Sample) -> tuple[Photographs | None, list[str]]:
+    """None where there is nothing to compare: no photographs, no colors, or a few photographs of the same; and the
+    error of each photograph that cannot be read."""
+    if sample.rgb is None:
+        return None, []
+    shown, images, errors = [], [], []
+    for row, view in enumerate(sample.views):
+        try:
+            image = _small_image(view)
+        except SceneError as error:
+            errors.append(str(error))
+            continue
+        if image is not None:
+            shown.append(row)
+            images.append(image)
+    has_colors = float(sample.rgb.std(axis=0).max()) >= MIN_COLOR_DEVIATION
+    sample = sample.of_views(shown)
     shapes = [grid_shape(camera) for camera in sample.cameras]
     small = [_resized(image, columns, rows) for image, (rows, columns) in zip(images, shapes, strict=True)]
     grids = [_with_rivals(grid, small) for grid in small]
-    if sum(len(grid) - 1 for grid in grids) < MIN_COMPARISONS:
-        return None
-    return Photographs(sample, images, grids)
-
-
-def unreadable(views: Iterable[View]) -> list[str]:
-    """The error of each photograph of these views that cannot be read."""
-    found = []
-    for view in views:
-        try:
-            view.image_rgb()
-        except SceneError as error:
-            found.append(str(error))
-    return found
+    is_enough = has_colors and sum(len(grid) - 1 for grid in grids) >= MIN_COMPARISONS
+    return (Photographs(sample, images, grids) if is_enough else None), errors
 
 
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
@@ -113,11 +111,8 @@ def _resized(image: NDArray[np.generic], width: int, height: int) -> Floats:
 
 
 def _small_image(view: View) -> Floats | None:
-    """None for a photograph that shows nothing, or cannot be read: `unreadable` says why."""
-    try:
-        image = view.image_rgb()
-    except SceneError:
-        return None
+    """None for a photograph that shows nothing. SceneError where it cannot be read."""
+    image = view.image_rgb()
     if image is None:
         return None
     small = shrunk(image, MAX_SIDE_PX)

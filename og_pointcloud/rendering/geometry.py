@@ -206,20 +206,10 @@ def distinct_positions(xyz: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDA
 def strided(camera: Camera, stride: int) -> Camera:
     """The camera of every stride-th pixel, ``image[stride // 2 :: stride, stride // 2 :: stride]``."""
     first = stride // 2
-
-    def center(c: float) -> float:
-        """Pixel i of the result is pixel first + stride i, and centers of pixels lie at halves."""
-        return (c - first - 0.5) / stride + 0.5
-
-    return replace(
-        camera,
-        width=-(-(camera.width - first) // stride),
-        height=-(-(camera.height - first) // stride),
-        fx=camera.fx / stride,
-        fy=camera.fy / stride,
-        cx=center(camera.cx),
-        cy=center(camera.cy),
-    )
+    width, height = (-(-(side - first) // stride) for side in (camera.width, camera.height))
+    # Pixel i of the result is pixel first + stride i, and centers of pixels lie at halves.
+    cx, cy = ((center - first - 0.5) / stride + 0.5 for center in (camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=camera.fx / stride, fy=camera.fy / stride, cx=cx, cy=cy)
 
 
 def thinned(view: View, stride: int) -> View:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from labelled_clouds import unit_rows
 from numpy.typing import ArrayLike, NDArray
 from pinhole import looking
 from reference_splatting import pixel_weights, reference_pixel_weights
-from scenes import ray_cast
+from scenes import ray_cast, write_scene
 from scipy.sparse import csr_array
 
 from hard_cases import naive
@@ -123,26 +122,8 @@ def two_balls(
 
 def write_two_balls(folder: Path, **how: Any) -> NDArray[np.int32]:
     """The same as a capture folder in world coordinates; returns the ball of each point."""
-    import cv2
-
-    from og_pointcloud.formats.ply import join_columns, write_ply
-
     scene, balls = two_balls(**how)
-    (folder / "masks").mkdir(parents=True)
-    columns = dict(zip("xyz", scene.points.xyz_world.T, strict=True))
-    write_ply(folder / "points.ply", {"vertex": join_columns(columns)})
-    frames = []
-    for view in scene.views:
-        (folder / "masks" / f"{view.name}.png").write_bytes(
-            cv2.imencode(".png", (view.mask_map() + 1).astype(np.uint16))[1].tobytes()
-        )
-        center, rotation = view.camera.center + scene.points.origin, view.camera.world_to_camera[:3, :3].T
-        pose = rigid(rotation @ np.diag([1.0, -1.0, -1.0]), center)
-        frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": pose.tolist()})
-    intrinsics = {"fl_x": 40.0, "fl_y": 40.0, "cx": 24.0, "cy": 18.0, "w": 48, "h": 36}
-    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
-    features = {view.name: view.mask_features for view in scene.views}
-    np.savez(folder / "mask_features.npz", allow_pickle=False, feature_space=np.array(SPACE), **features)
+    write_scene(folder, scene)
     return balls
 
 
