@@ -306,12 +306,9 @@ class LabelledCloud:
                 f"{UNOBSERVED}..{len(self.instances) - 1}"
             )
         object.__setattr__(self, "instance_ids", _as_stored(self.instance_ids, np.int32, "instance ids"))
-        if self.rgb is not None and (self.rgb.shape != (n, 3) or self.rgb.dtype != np.uint8):
-            raise OgPointcloudError(f"rgb is {self.rgb.dtype} {self.rgb.shape}; expected uint8 ({n}, 3), 0 to 255")
-        if self.certainty is not None and (self.certainty.shape != (n,) or self.certainty.dtype != np.uint8):
-            raise OgPointcloudError(
-                f"certainty is {self.certainty.dtype} {self.certainty.shape}; expected uint8 {(n,)}"
-            )
+        for name, values, shape in (("rgb", self.rgb, (n, 3)), ("certainty", self.certainty, (n,))):
+            if values is not None and (values.shape != shape or values.dtype != np.uint8):
+                raise OgPointcloudError(f"{name} is {values.dtype} {values.shape}; expected uint8 {shape}, 0 to 255")
         for name in ("spacing", "reach"):
             value = getattr(self, name)
             if not LENGTH_LIMITS[0] <= value <= LENGTH_LIMITS[1]:

@@ -2,7 +2,6 @@
 
 import base64
 import importlib
-import json
 import shutil
 import signal
 import subprocess
@@ -18,6 +17,7 @@ import pytest
 from commands import error_of
 from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
+from test_view import content
 
 import og_pointcloud as og
 from og_pointcloud.ask.picking import front_points
@@ -506,8 +506,7 @@ def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, pages
 def test_the_page_of_changes_calls_nothing_unknown_that_is_as_it_was(visits_of_a_place, tmp_path):
     before, after, changes = visits_of_a_place
     write_changes_page(tmp_path / "changes.html", before, after, changes, np.array([0.0, 0, 1]))
-    text = (tmp_path / "changes.html").read_text().split('type="application/json">')[1].split("</script>")[0]
-    data = json.loads(text)
+    data = content(tmp_path / "changes.html")
     both, change = both_visits(before, after, changes)
     still = np.isin(both.instance_ids, np.flatnonzero(change < 4), invert=True)
     assert (data["unlabelled"], data["unknown"]) == ("as it was, or not seen again", still.sum())

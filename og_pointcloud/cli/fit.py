@@ -120,8 +120,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     for fit in made:
         if fit.doubts:
             doubts = ", ".join(fit.doubts)
-            why = printable(f"{fit.name}: {doubts} (og-pointcloud info {shlex.quote(fit.output)} says why)")
-            print(f"doubt: {why}")
+            print(f"doubt: {fit.name}: {doubts} (og-pointcloud info {shlex.quote(fit.output)} says why)")
     for fit in failed:
         cause = fit.cause if fit.capture in fit.cause else f"{fit.capture}: {fit.cause}"
         print(f"failed: {printable(cause)}", file=sys.stderr)

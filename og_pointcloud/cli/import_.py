@@ -11,7 +11,7 @@ from pathlib import Path
 
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser, add_option
-from og_pointcloud.errors import OgPointcloudError, printable
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.journal import Journal
 
@@ -58,6 +58,6 @@ def unpack(file: Path, folder: Path) -> None:
         made.mkdir()
         images, unused = unpack_e57(file, made)
     for line in unused:
-        print(f"left out: {printable(line)}")
+        print(f"left out: {line}")
     print(f"wrote {folder}: {images} images with poses, and the cloud of all scans")
     common.print_next("masks", folder)
