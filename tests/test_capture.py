@@ -1,11 +1,11 @@
 """A capture folder becomes the same Scene whatever its format, and each thing that can be wrong has one clear error."""
 
-import json
 import shutil
 import struct
 import sys
 import warnings
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -57,29 +57,23 @@ def refused(folder, says):
         read_capture(folder)
 
 
-def write_nerfstudio(folder, world):
-    write_transforms(folder, world, per_frame=True, ply_file_path="points.ply")
-
-
 def write_blender(folder, world):
     """Square pixels and a centered principal point are all that this format can say."""
-    write_transforms(folder, world, suffix="", name="transforms_train.json")
-    content = json.loads((folder / "transforms_train.json").read_text())
-    content = {"camera_angle_x": 2 * np.arctan(0.5 * WIDTH / world.intrinsics[0]), "frames": content["frames"]}
-    (folder / "transforms_train.json").write_text(json.dumps(content))
-
-
-def write_sparse_binary(folder, world):
-    write_colmap_binary(folder / "sparse/0", world)
-
-
-def write_sparse_text(folder, world):
-    write_colmap_text(folder / "colmap/sparse/0", world)
+    angle = 2 * np.arctan(0.5 * WIDTH / world.intrinsics[0])
+    others = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    write_transforms(folder, world, suffix="", name="transforms_train.json", camera_angle_x=angle, **others)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 @pytest.mark.parametrize(
-    "write", [write_transforms, write_nerfstudio, write_blender, write_sparse_binary, write_sparse_text]
+    "write",
+    [
+        write_transforms,
+        partial(write_transforms, per_frame=True, ply_file_path="points.ply"),
+        write_blender,
+        lambda folder, world: write_colmap_binary(folder / "sparse/0", world),
+        lambda folder, world: write_colmap_text(folder / "colmap/sparse/0", world),
+    ],
 )
 def test_all_formats_give_the_same_scene(tmp_path, write, offset):
     shift = np.array([offset, -offset, offset / 3])

@@ -29,8 +29,9 @@ def transform_of(scale, rotation, translation):
     )
 
 
-def metashape(world, *, sensors=None, in_chunk=None, extra="", component="", name="Chunk 1", cameras=None):
-    """The XML of one chunk. in_chunk: world -> chunk of the points (3, 3) scaled rotation and (3,)."""
+def metashape(world, *, sensors=None, in_chunk=None, extra="", component="", name="Chunk 1", cameras="", groups=None):
+    """The XML of one chunk. in_chunk: world -> chunk of the points (3, 3) scaled rotation and (3,). groups: of each
+    camera; None: the last one has one."""
     lines = []
     for index, (label, pose) in enumerate(zip(world.names, world.poses, strict=True)):
         to_world = np.linalg.inv(pose)
@@ -41,11 +42,15 @@ def metashape(world, *, sensors=None, in_chunk=None, extra="", component="", nam
         where = f'<transform>{numbers(to_world)}</transform><orientation>6</orientation><reference enabled="0"/>'
         keys = f'id="{index}" sensor_id="{index % len(sensors or [1])}" {component} label="{label}"'
         lines.append(f"<camera {keys}>{where}</camera>")
-    lines[-1] = f'<group id="0" label="Group 1" type="folder">{lines[-1]}</group>'
+    of_camera = groups or [*[None] * (len(lines) - 1), "Group 1"]
+    lines = [
+        f'<group id="0" label="{group}" type="folder">{line}</group>' if group else line
+        for group, line in zip(of_camera, lines, strict=True)
+    ]
     made = sensors or [SENSOR.format(id=0, type="frame", terms=TERMS)]
     return (
         f'<chunk label="{name}" enabled="true"><sensors next_id="1">{"".join(made)}</sensors>'
-        f'<cameras next_id="3" next_group_id="1">{"".join(lines)}{cameras or ""}</cameras>{extra}</chunk>'
+        f'<cameras next_id="3" next_group_id="1">{"".join(lines)}{cameras}</cameras>{extra}</chunk>'
     )
 
 
@@ -163,18 +168,11 @@ def test_components_without_a_common_world_are_refused(tmp_path, in_chunk):
 def test_repeated_labels_are_told_apart_by_their_groups(tmp_path):
     world = make_world()
     world.names = ["a", "a", "b"]
-    text = (
-        document(metashape(world)).replace('<group id="0" label="Group 1" type="folder">', "").replace("</group>", "")
-    )
-    for label in ("left", "right"):
-        text = text.replace("<camera ", f'<group label="{label}"><CAMERA ', 1).replace(
-            "</camera>", "</CAMERA></group>", 1
-        )
-        write_images(tmp_path, [f"{label}/a"])
-    text = text.replace("CAMERA", "camera")
-    assert [image.path for image in read(tmp_path, text).images] == ["left/a", "right/a", "b"]
+    write_images(tmp_path, ["left/a", "right/a"])
+    frames = read(tmp_path, document(metashape(world, groups=["left", "right", None])))
+    assert [image.path for image in frames.images] == ["left/a", "right/a", "b"]
     assert read_poses(tmp_path).names == ("left/a", "right/a", "b")
-    (tmp_path / "cameras.xml").write_text(text.replace('"right"', '"left"'))
+    (tmp_path / "cameras.xml").write_text(document(metashape(world, groups=["left", "left", None])))
     with pytest.raises(SceneError, match=r"cameras.xml: two images have the path 'left/a'; expected unique ones"):
         read_poses(tmp_path)
 
