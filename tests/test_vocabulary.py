@@ -376,9 +376,12 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
 
 @pytest.mark.filterwarnings("ignore:none of")
 def test_an_encoder_carried_by_a_scene_of_an_unnamed_space_answers(encoder_folder, tmp_path):
-    path = write_bundle(replace(room(100), feature_space="unknown"), tmp_path / "s.ogpc")
-    carry_encoder(path, encoder_folder)
-    assert og.segment(path, ["cat"]).names == ("cat",)
+    cloud = replace(room(100), feature_space="unknown")
+    stored = write_bundle(cloud, tmp_path / "stored.ogpc")
+    carry_encoder(stored, encoder_folder)
+    for path in (stored, write_bundle(cloud, tmp_path / "written.ogpc", text_encoder=encoder_folder)):
+        assert og.segment(path, ["cat"]).names == ("cat",)
+        assert og.load(path).cloud.word_bank is not None
 
 
 def test_a_scene_outlives_its_file(path, encoder_folder):

@@ -287,7 +287,7 @@ class _Table:
     def grid(self, blocks: NDArray[np.int64], references: NDArray[np.int64]) -> LookupGrid:
         """The finished grid, with the references of the bricks in these blocks."""
         listed = np.full((1, CHILDREN), 2 * self._codes, np.int32)  # the last row, see `nodes`
-        nodes = _compact(np.concatenate([*self._nodes, listed]))
+        nodes = compact(np.concatenate([*self._nodes, listed]))
         bricks = np.where(references < 0, len(nodes) - 1 - references, references)
         block_row = np.full(self._frame.blocks, _FAR, np.int64)
         if not self._frame.holds_all:  # the outermost bricks represent the points that lie beyond
@@ -302,11 +302,11 @@ class _Table:
             low=self._frame.low.astype(np.float32),
             cell_size=np.float32(self._frame.cell_size),
             shape=self._frame.shape,
-            blocks=_compact(block_row),
-            bricks=_compact(np.concatenate([shared, bricks])),
+            blocks=compact(block_row),
+            bricks=compact(np.concatenate([shared, bricks])),
             nodes=nodes,
             first_child=np.append(np.concatenate(self._first_child), -1).astype(np.int32),
-            child_length=_compact(np.append(np.concatenate(self._child_length), 0)),  # never empty: the graph reads it
+            child_length=compact(np.append(np.concatenate(self._child_length), 0)),  # never empty: the graph reads it
             child_start=np.append(np.concatenate(self._child_start), 0).astype(np.int32),
             candidates=np.concatenate(self._candidates),
             codes=self._codes,
@@ -329,5 +329,6 @@ _CHILD_OFFSETS = np.stack(np.unravel_index(np.arange(CHILDREN), (EDGE,) * 3), ax
 """(64, 3): offsets of a box's children along each axis, in C order."""
 
 
-def _compact(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
+def compact(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
+    """Whole numbers from 0 in the smallest type that holds them."""
     return values.astype(np.min_scalar_type(int(values.max(initial=0))))

@@ -25,7 +25,7 @@ from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import naming_extra
 from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, MAX_LIST_LENGTH, MAX_SHARED_LIST_LENGTH, TOO_FAR_CODE
-from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid
+from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid, compact
 
 with naming_extra("onnx", "fit"):
     import onnx
@@ -185,13 +185,12 @@ class _Lookup:
         answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
         for row, axis in enumerate("xyz"):
             graph.constant(f"candidate_{axis}", np.ascontiguousarray(xyz[:, row]))
-        graph.constant("candidate_answer", answer.astype(np.min_scalar_type(int(answer.max()))))
+        graph.constant("candidate_answer", compact(answer))
         # Indices below 2^24, which are almost all, take three bytes instead of four: the high part has the smallest
         # type that fits. A search may read MAX_LIST_LENGTH entries from the start of the last list, hence the padding.
         candidate = np.append(candidate, np.zeros(MAX_LIST_LENGTH, np.int64))
-        high = candidate >> 16
         graph.constant("candidates_low", (candidate & 0xFFFF).astype(np.uint16))
-        graph.constant("candidates_high", high.astype(np.min_scalar_type(int(high.max()))))
+        graph.constant("candidates_high", compact(candidate >> 16))
 
     def answer(self, code_label: str, code_score: str) -> None:
         """Add all outputs but instance_scores."""

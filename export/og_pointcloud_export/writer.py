@@ -106,8 +106,7 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
 
 
 def _smallest_signed(ids: NDArray[np.int32]) -> NDArray[np.signedinteger]:
-    largest = int(ids.max(initial=0))
-    return ids.astype(next(kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max))
+    return ids.astype(np.min_scalar_type(-1 - int(ids.max(initial=0))))  # which holds as many numbers from 0 on
 
 
 def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:

@@ -88,7 +88,9 @@ def bank_of_encoder(space: FeatureSpace, folder: StrPath | None = None) -> WordB
     """The word bank of a text encoder's folder, or of the encoder found for the space; None if it has none or is of
     another space."""
     encoder = find_encoder(space.name) if folder is None else read_text_encoder(folder)
-    return encoder.word_bank if encoder is not None and encoder.feature_space == space.name else None
+    if encoder is None or not FeatureSpace(space.name, 0).accepts(FeatureSpace(encoder.feature_space, 0)):
+        return None
+    return encoder.word_bank
 
 
 def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrPath | None = None) -> Vocabulary:
@@ -107,9 +109,8 @@ def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrP
         old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
         if old.names:  # if no instance has a descriptor, they alone tell the width of the space
             FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
-        vectors = dict(
-            zip(old.names, unit_rows(old.vectors), strict=True)
-        )  # for a word in both, the later vector stays
+        vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))
+        # For a word in both, the later vector stays.
         vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
         merged = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
         counts = {**bundle.manifest["counts"], "words": len(merged.names)}
