@@ -82,9 +82,6 @@ class Logger:
     def info(self, text):
         self.lines.append(("info", text))
 
-    def error(self, text):
-        self.lines.append(("error", text))
-
     def warning(self, text, throttle_duration_sec):
         assert throttle_duration_sec > 0
         self.lines.append(("warning", text))
@@ -223,7 +220,6 @@ def install(monkeypatch):
         "rclpy.logging": rclpy.logging,
         "rclpy.executors": rclpy.executors,
         "rclpy.node": module("rclpy.node", Node=Node),
-        "rclpy.parameter": module("rclpy.parameter", Parameter=Parameter),
         "rclpy.qos": module("rclpy.qos", QoSProfile=QoSProfile, **policies),
         "rclpy.time": module("rclpy.time", Time=Time),
         "rcl_interfaces": module("rcl_interfaces"),
@@ -234,7 +230,7 @@ def install(monkeypatch):
             TransformException=TransformException,
             TransformListener=lambda buffer, node: SimpleNamespace(buffer=buffer, node=node),
         ),
-        **message_package("std_msgs", "Header String"),
+        **message_package("std_msgs", "Header"),
         **message_package("builtin_interfaces", "Time"),
         **message_package("sensor_msgs", "PointCloud2 PointField Image CameraInfo RegionOfInterest"),
         "std_srvs": module("std_srvs"),

@@ -73,6 +73,7 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(og.Mapper, "integrate", interrupted)
         assert main(arguments) == 130
+    assert "room.ogpc.map': the map so far; --resume continues it" in capsys.readouterr().err
     assert not (tmp_path / "room.ogpc.map" / ".lock").exists(), "other processes are still kept out"
     assert main(arguments) == 2
     assert "add --resume" in capsys.readouterr().err
@@ -215,10 +216,10 @@ def test_a_frame_stands_where_its_depth_was_measured(tmp_path):
         assert (len(list(bag)), bag.dropped) == (1, {})
 
 
-@pytest.mark.parametrize("topic", ["/depth/image_rect", "/masks", "/camera_info"])
-def test_what_a_bag_lacks_is_named(tmp_path, topic):
-    bag = write_bag(tmp_path / "drive", frames(THINGS)[:1], without=(topic,))
-    with pytest.raises(SceneError, match=r"has no (depth|masks|info)"):
+@pytest.mark.parametrize("role", ["depth", "masks", "features", "info"])
+def test_what_a_bag_lacks_is_named(tmp_path, role):
+    bag = write_bag(tmp_path / "drive", frames(THINGS)[:1], without=(TOPICS[role],))
+    with pytest.raises(SceneError, match=f"has no {role}; expected "):
         BagFrames(bag)
 
 

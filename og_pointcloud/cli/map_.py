@@ -11,9 +11,13 @@ import sys
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from og_pointcloud.cli.common import SHOWN, Parser, add_option, add_output, add_shared, print_next, replaceable
 from og_pointcloud.errors import OgPointcloudError, counted
+
+if TYPE_CHECKING:
+    from og_pointcloud.mapping.mapper import Mapper
 
 
 def add(parser: Parser) -> None:
@@ -28,17 +32,33 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud_ros.map_bags import BagFrames
-    from tqdm import tqdm
-
     from og_pointcloud.mapping.map_journal import holds_map
-    from og_pointcloud.mapping.mapper import Mapper
 
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.map")
     if work.exists() and not holds_map(work):  # it is removed at the end
         raise OgPointcloudError(f"--work is '{work}', which has other files than a map; expected a new folder name")
     if work.exists() and not arguments.resume:
         raise OgPointcloudError(f"'{work}' contains an interrupted map: add --resume, or remove it")
+    try:
+        mapper, taken = saved_map(arguments, work)
+    except KeyboardInterrupt:
+        if work.exists():
+            print(f"kept in '{work}': the map so far; --resume continues it", file=sys.stderr)
+        raise
+    shutil.rmtree(work)
+    made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
+    print(", ".join(counted(count, thing) for count, thing in made))
+    print(f"wrote {arguments.output}")
+    print_next("info", arguments.output)
+
+
+def saved_map(arguments: argparse.Namespace, work: Path) -> tuple[Mapper, int]:
+    """The map of a bag, saved, and the number of frames that went in now. work: of its journal."""
+    from og_pointcloud_ros.map_bags import BagFrames
+    from tqdm import tqdm
+
+    from og_pointcloud.mapping.mapper import Mapper
+
     frames, refused, taken = BagFrames(arguments.bag, arguments.frame), Counter[str](), 0
     with Mapper(arguments.start, feature_space=arguments.feature_space, journal=work) as mapper:
         for frame in tqdm(frames, desc="frames", disable=None, leave=False):
@@ -53,11 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
         if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
             shutil.rmtree(work)
         mapper.save(arguments.output)
-    shutil.rmtree(work)
-    made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
-    print(", ".join(counted(count, thing) for count, thing in made))
-    print(f"wrote {arguments.output}")
-    print_next("info", arguments.output)
+    return mapper, taken
 
 
 def print_left_out(reasons: list[tuple[str, int]]) -> None:

@@ -30,7 +30,8 @@ MAX_PENDING_STAMPS = 100
 class BagFrames:
     """Iterates over the frames of a bag. frame: the map's frame in tf. dropped: reason -> number of unusable frames.
 
-    SceneError if the bag has no depth, no masks, no camera_info, or several of which none has the depth's frame_id.
+    SceneError if the bag has no depth, no masks, no features, no camera_info, or several of which none has the depth's
+    frame_id.
     """
 
     def __init__(self, source: str | os.PathLike[str], frame: str = "map") -> None:
@@ -42,7 +43,7 @@ class BagFrames:
         self._roles = {names[0]: role for role, names in topics.items()}
 
     def __iter__(self) -> Iterator[Frame]:
-        required = [role for role in (*REQUIRED_ROLES, "color") if role in self._roles.values()]
+        required = (*REQUIRED_ROLES, "color") if "color" in self._roles.values() else REQUIRED_ROLES
         rectified = any("rect" in topic.lower() for topic, role in self._roles.items() if role in ("depth", "masks"))
         store, assembler = ros2_types(), FrameAssembler(required, rectified=rectified)
         with open_bag(self.source) as reader:
@@ -78,7 +79,8 @@ def _topics_by_role(topics: list[tuple[str, str]], source: str) -> dict[str, lis
         if role := _role(topic.lower(), kind):
             found.setdefault(role, []).append(topic)
     for role, expected in (("depth", "an Image whose topic has 'depth' in its name"), ("info", "a CameraInfo"),
-                           ("masks", "an Image whose topic has 'mask' in its name")):  # fmt: skip
+                           ("masks", "an Image whose topic has 'mask' in its name"),
+                           ("features", "a PointCloud2 whose topic has 'feature' in its name")):  # fmt: skip
         if role not in found:
             raise SceneError(f"{source} has no {role}; expected {expected}; it has {', '.join(t for t, _ in topics)}")
     depth = found["depth"][0]
