@@ -44,12 +44,5 @@ def test_small_chunks_change_nothing(monkeypatch):
     assert (search(cloud, points) == whole).all()
 
 
-def test_units_change_nothing():
-    cloud = room(500)
-    points = queries(cloud, 200)
-    scaled = make_cloud(cloud.xyz * 1024, cloud.instance_ids, cloud.spacing * 1024, cloud.reach * 1024)
-    assert (search(scaled, points * 1024) == search(cloud, points)).all()
-
-
 def test_no_queries():
     assert search(room(50), np.zeros((0, 3), np.float32)).shape == (0,)

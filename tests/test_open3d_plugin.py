@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labelled_clouds import make_cloud
+from labelled_clouds import make_cloud, quietly
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
@@ -78,6 +78,7 @@ def test_a_result_becomes_a_tensor_cloud(scene):
     assert np.array_equal(cloud.point["og_instance"].numpy()[:, 0], result.instances)
     again = og3.segment(cloud, WORDS, scene).result
     assert np.array_equal(again.labels, result.labels)
+    assert len(quietly(np.zeros((0, 3)), WORDS, scene).to_open3d().point["og_label"]) == 0
 
 
 def test_other_arguments_reach_segment(scene):

@@ -40,9 +40,12 @@ OUTPUTS = ["label", "score", "instance", "distance", "certain", "instance_scores
 
 
 def run(cloud, points, text):
-    session = open_session(build_query_graph(cloud, build_lookup_grid(cloud)))
+    return answers(build_query_graph(cloud, build_lookup_grid(cloud)), points, text)
+
+
+def answers(graph, points, text):
     feed = {"points": np.asarray(points, np.float32).reshape(-1, 3), "text": np.asarray(text, np.float32)}
-    return dict(zip(OUTPUTS, session.run(OUTPUTS, feed), strict=True))
+    return dict(zip(OUTPUTS, open_session(graph).run(OUTPUTS, feed), strict=True))
 
 
 def texts(cloud, count=5):
@@ -51,22 +54,17 @@ def texts(cloud, count=5):
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-def test_certain_answers_are_exact_on_tough_clouds(name):
+def test_tough_clouds_get_exact_answers_from_a_graph_that_readers_know(name):
+    """Whoever changes the graph adds its digest to KNOWN_GRAPHS."""
     cloud = CLOUDS[name]
-    points = queries(cloud, 300)
-    found = run(cloud, points, texts(cloud))
+    points, text = queries(cloud, 300), texts(cloud)
+    graph = build_query_graph(cloud, build_lookup_grid(cloud))
+    assert query_tables(graph)["codes"].tolist() == [len(cloud.instances) + 3]
+    found = answers(graph, points, text)
     exact = instances_plainly(cloud, points)
     assert (found["instance"][found["certain"]] == exact[found["certain"]]).all()
     assert found["instance"].min() >= TOO_FAR
     assert found["instance"].max(initial=-1) < max(len(cloud.instances), 1)
-
-
-@pytest.mark.parametrize("name", CLOUDS)
-def test_scores_and_labels_are_those_of_float64(name):
-    cloud = CLOUDS[name]
-    text = texts(cloud)
-    points = queries(cloud, 100)
-    found = run(cloud, points, text)
     reference = reference_scores(cloud.instances, text)
     assert found["instance_scores"].shape == (len(cloud.instances), len(text))
     assert np.abs(found["instance_scores"] - reference).max(initial=0) < 1e-6
@@ -361,18 +359,10 @@ AWKWARD_TEXT = np.concatenate(
 ).astype(np.float32)
 
 
-def test_torch_onnxruntime_and_numpy_agree():
-    torch = pytest.importorskip("torch")
+def test_scores_of_texts_of_any_length_are_those_of_float64():
     cloud = make_cloud(np.zeros((1, 3)), [0], instances=instance_table(5, [0, 0, 1, 2, 4]))
-    table = cloud.instances
-    text = torch.nn.functional.normalize(torch.from_numpy(AWKWARD_TEXT).double(), dim=1, eps=1e-300)
-    cosine = torch.from_numpy(table.descriptors).double() @ text.T
-    by_torch = torch.full((5, len(text)), -2.0, dtype=torch.float64)
-    owner = torch.from_numpy(table.descriptor_instance).long()[:, None].expand_as(cosine)
-    by_torch = by_torch.scatter_reduce(0, owner, cosine, "amax").numpy()
-    by_onnxruntime = run(cloud, [[0, 0, 0]], AWKWARD_TEXT)["instance_scores"]
-    assert np.abs(by_onnxruntime - by_torch).max() < 1e-5
-    assert np.abs(reference_scores(table, AWKWARD_TEXT) - by_torch).max() < 1e-5
+    found = run(cloud, [[0, 0, 0]], AWKWARD_TEXT)["instance_scores"]
+    assert np.abs(found - reference_scores(cloud.instances, AWKWARD_TEXT)).max() < 1e-5
 
 
 def test_an_instance_answers_with_its_best_descriptor():
@@ -430,23 +420,13 @@ def test_the_documented_program_of_probabilities_answers_like_the_library(tmp_pa
     np.testing.assert_allclose(names["scores"], result.scores, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", CLOUDS)
-def test_every_graph_we_write_passes_the_readers_check(name):
-    """Whoever changes the graph adds its digest to KNOWN_GRAPHS."""
-    tables = query_tables(build_query_graph(CLOUDS[name], build_lookup_grid(CLOUDS[name])))
-    assert tables["codes"].tolist() == [len(CLOUDS[name].instances) + 3]
-
-
 HARMS = {
     "another domain": lambda model: setattr(model.graph.node[0], "domain", "com.stranger"),
     "another opset": lambda model: model.opset_import.add(domain="com.microsoft", version=1),
-    "a loop": lambda model: setattr(model.graph.node[0], "op_type", "Loop"),
-    "a graph in a node": lambda model: model.graph.node[0].attribute.add(name="body", type=onnx.AttributeProto.GRAPH),
     "a function": lambda model: model.functions.add(name="f", domain=""),
-    "a huge table": lambda model: model.graph.initializer[0].dims.append(1 << 40),
-    "another file": lambda model: setattr(model.graph.initializer[0], "data_location", onnx.TensorProto.EXTERNAL),
-    "a sparse table": lambda model: model.graph.sparse_initializer.add(),
+    "a note": lambda model: model.metadata_props.add(key="a", value="b"),
 }
+"""Of the whole file; UNKNOWN_GRAPHS of hostile_files change its graph, and test_text_encoder's harms its constants."""
 
 
 @pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)

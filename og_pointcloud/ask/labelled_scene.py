@@ -319,7 +319,7 @@ class Segmenter:
         are_own = own is not None and own.cloud is scene.cloud and pose is None
         if are_own:  # no look-up needed
             points, instances = scene.xyz.copy(), scene.instance_ids.copy()
-            certainty_of = partial(scene.certainty_at, scene.xyz)
+            certainty_of = scene.certainty
         else:
             points = _posed(world_points(pcd) if own is None else own.xyz.copy(), pose)
             local = scene._local(points)  # a copy: a later change of the result's points does not change its certainty
