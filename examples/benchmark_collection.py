@@ -109,11 +109,15 @@ def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud
     rng = np.random.default_rng(number)
     xyz = rng.random((instances, 1, 3)) * [20, 20, 3] + 0.3 * rng.random((instances, 20, 3))
     ids = np.repeat(np.arange(instances, dtype=np.int32), 20)
-    ones, ratios = np.full(instances, 20, np.int32), np.full(instances, 0.9, np.float32)
-    rows = encoder.descriptors(rng.integers(0, WORDS, instances))
-    table = og.InstanceTable(rows, np.arange(instances, dtype=np.int32), ones, ones, ones, ratios, ratios)
+    table = table_of(encoder.descriptors(rng.integers(0, WORDS, instances)))
     points = xyz.reshape(-1, 3).astype(np.float32)
     return og.LabelledCloud(points, np.zeros(3), ids, table, SPACE, 0.1, 0.3, vocabulary=encoder.words)
+
+
+def table_of(rows: NDArray[np.float32]) -> og.InstanceTable:
+    """An instance of 20 points for each descriptor."""
+    twenty, ratios = np.full(len(rows), 20, np.int32), np.full(len(rows), 0.9, np.float32)
+    return og.InstanceTable(rows, np.arange(len(rows), dtype=np.int32), twenty, twenty, twenty, ratios, ratios)
 
 
 def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, with_lance: bool) -> None:
@@ -220,12 +224,9 @@ def made_scenes(
     descriptors: int, instances: int, encoder: MadeEncoder
 ) -> Iterator[tuple[og.InstanceTable, NDArray[np.float64]]]:
     """Scenes with this many instances, one descriptor each, and the corners of their boxes."""
-    twenty, ratios = np.full(instances, 20, np.int32), np.full(instances, 0.9, np.float32)
     for _ in range(descriptors // instances):
         low = np.append(encoder.rng.random(2) * 990, 0) + encoder.rng.random((instances, 3)) * [10, 10, 3]
-        vectors = encoder.descriptors(encoder.rng.integers(0, WORDS, instances))
-        owner = np.arange(instances, dtype=np.int32)
-        table = og.InstanceTable(vectors, owner, twenty, twenty, twenty, ratios, ratios)
+        table = table_of(encoder.descriptors(encoder.rng.integers(0, WORDS, instances)))
         yield table, np.stack([low, low + 0.3], axis=1)
 
 

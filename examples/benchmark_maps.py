@@ -148,8 +148,8 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
         batch, fused, seconds = float("nan"), float("nan"), float("nan")
         if not options.no_fit:
             begun = time.perf_counter()
-            names = {f"{frame.stamp:g}" for frame in frames[:until]}
-            views = tuple(view for number, view in enumerate(capture.views) if f"{float(number):g}" in names)
+            stamps = {frame.stamp for frame in frames[:until]}
+            views = tuple(view for number, view in enumerate(capture.views) if number in stamps)
             same = replace(capture, views=views)
             batch, seconds = miou(og.fit(same, progress=False), folder, xyz), time.perf_counter() - begun
             if all(frame.depth is not None for frame in frames):

@@ -15,7 +15,6 @@ OUT/splats.csv, and for each room OUT/NAME.png: photograph, 3DGS, truth, drawn l
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -36,10 +35,12 @@ from og_pointcloud.evaluate.metrics import Score
 from og_pointcloud.evaluate.sweep import warm_up
 from og_pointcloud.evaluate.truth import GT_NAME, Truth
 from og_pointcloud.fitting.fit import fit_prepared, prepare
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.ply import write_ply
+from og_pointcloud.formats.tables import csv_text
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.splatting import Gaussians, render, view_weights
 from og_pointcloud.scene import Camera, Points
@@ -91,11 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in rooms:
         rows.append(measured(name, options.output))
         print(" | ".join(f"{v:.4f}" if isinstance(v, float) else str(v) for v in asdict(rows[-1]).values()), flush=True)
-    with (options.output / "splats.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, [each.name for each in fields(Row)])
-        writer.writeheader()
-        writer.writerows(map(asdict, rows))
-    print(options.output / "splats.csv")
+    print(write_file(options.output / "splats.csv", csv_text([asdict(row) for row in rows]).encode()))
 
 
 def measured(name: str, output: Path) -> Row:
@@ -145,12 +142,7 @@ def _without_held_out(capture: RoomCapture) -> RoomCapture:
 
 
 def _cameras(capture: RoomCapture, views: Sequence[int] | NDArray[np.int64]) -> list[Camera]:
-    lens = capture.intrinsics
-    focal, middle = (lens.focal_px, lens.focal_px), (lens.width / 2, lens.height / 2)
-    return [
-        Camera(lens.width, lens.height, *focal, *middle, np.linalg.inv(capture.frames[k].camera_to_world.astype(float)))
-        for k in views
-    ]
+    return [capture.intrinsics.camera(capture.frames[k].camera_to_world) for k in views]
 
 
 def _trained_on(capture: RoomCapture) -> Points:

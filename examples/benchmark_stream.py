@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import tempfile
 import time
 import warnings
@@ -21,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.cloud import unit_rows
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 SETTLED = 10_000
 """Frames after which buffers have their final size."""
@@ -69,14 +71,11 @@ def stream(scene: og.LabelledScene, frames: int, points: int) -> Iterator[float]
 
 def made_room() -> og.LabelledCloud:
     """500 points in 8 things, with a word for each."""
-    random = np.random.default_rng(0)
-    ids = np.arange(500, dtype=np.int32) % 8
+    from labelled_clouds import make_cloud  # pyright: ignore[reportMissingImports]  (in tests/)
+
+    random, ids = np.random.default_rng(0), np.arange(500) % 8
     xyz = (random.random((8, 3)) * 4)[ids] + 0.2 * random.random((500, 3))
-    rows = unit_rows(random.normal(size=(8, 16))).astype(np.float32)
-    ones, ratios = np.full(8, 62, np.int32), np.full(8, 0.9, np.float32)
-    table = og.InstanceTable(rows, np.arange(8, dtype=np.int32), ones, ones, ones, ratios, ratios)
-    words = og.Vocabulary(tuple(f"thing {k}" for k in range(8)), rows)
-    return og.LabelledCloud(xyz.astype(np.float32), np.zeros(3), ids, table, "made", 0.1, 0.3, vocabulary=words)
+    return make_cloud(xyz, ids, spacing=0.1, reach=0.3, words=tuple(f"thing {k}" for k in range(8)))
 
 
 def resident_mb() -> float:

@@ -4,8 +4,7 @@
     python examples/benchmark_visibility.py CAPTURE      # also the middle view of a capture, as `fit` draws it
 
 Errors are measured in a window small enough for a literal float64 reference (tests/reference_splatting.py), relative to
-the largest and to the mean weight. Below: what stronger cutoffs than 3DGS's would gain and lose. `make bench` compares
-two revisions.
+the largest and to the mean weight. `make bench` compares two revisions.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ if __name__ == "__main__":  # otherwise tests that import it would run on one co
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.rendering.splatting import Cutoffs, Gaussians, ViewWeights, view_weights
+from og_pointcloud.rendering.splatting import Gaussians, ViewWeights, view_weights
 from og_pointcloud.scene import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -35,12 +34,6 @@ SIZES = (10_000, 100_000, 300_000, 1_000_000)
 WINDOW = (64, 48)
 """Pixels that the literal reference draws."""
 RUNS = 5
-CUTOFFS = {
-    "3DGS: alpha 1/255, light 1e-4": Cutoffs(1 / 255, 1e-4),
-    "alpha 1/64": Cutoffs(1 / 64, 1e-4),
-    "light 1e-2": Cutoffs(1 / 255, 1e-2),
-    "alpha 1/32, light 1e-2": Cutoffs(1 / 32, 1e-2),
-}
 
 
 @dataclass(frozen=True)
@@ -55,11 +48,9 @@ class Case:
     near: float
     thickness: NDArray[np.float32] | None = None
 
-    def draw(self, cutoffs: Cutoffs = CUTOFFS["3DGS: alpha 1/255, light 1e-4"]) -> ViewWeights:
+    def draw(self) -> ViewWeights:
         """The kernel's result."""
-        return view_weights(
-            self.gaussians, self.camera, self.ids, self.mask_count, self.near, self.thickness, cutoffs=cutoffs
-        )
+        return view_weights(self.gaussians, self.camera, self.ids, self.mask_count, self.near, self.thickness)
 
 
 def room_case(count: int, width: int = IMAGE[0], height: int = IMAGE[1]) -> Case:
@@ -124,37 +115,25 @@ def errors(window: Case) -> tuple[float, float]:
     return float(error.max() / reference.max()), float(error.sum() / reference.sum())
 
 
-def fastest(work: Callable[[], ViewWeights]) -> tuple[float, ViewWeights]:
-    """Processor seconds, the least of several runs after a discarded one; and the result."""
-    result, taken = work(), []
-    for _ in range(RUNS):
+def fastest(work: Callable[[], ViewWeights]) -> float:
+    """Processor seconds, the least of several runs after a discarded one."""
+    taken = []
+    for _ in range(RUNS + 1):
         start = time.process_time()
-        result = work()
+        work()
         taken.append(time.process_time() - start)
-    return min(taken), result
+    return min(taken[1:])
 
 
 def print_kernel(cases: Sequence[Case]) -> None:
     """Print a row per case."""
     print(f"{'scene':<26} {'image':<10} {'s a view':>8} {'Gaussians/s':>12}  largest error  mean error")
     for case in cases:
-        seconds, _ = fastest(case.draw)
+        seconds = fastest(case.draw)
         largest, mean = errors(window_of(case))
         size = f"{case.camera.width}x{case.camera.height}"
         rate = len(case.gaussians) / seconds
         print(f"{case.name:<26} {size:<10} {seconds:8.4f} {rate:12.3g} {largest:14.1e} {mean:11.1e}", flush=True)
-
-
-def print_cutoffs(cases: Sequence[Case]) -> None:
-    """Print the weight lost and the time gained by stronger cutoffs than 3DGS's; errors of whole images."""
-    print(f"\n{'cut-offs':<30} {'scene':<26} {'s a view':>8} {'weight lost':>12} {'largest error, pixels':>22}")
-    for case in cases:
-        exact = case.draw().rows
-        for name, cutoffs in CUTOFFS.items():
-            seconds, shown = fastest(lambda: case.draw(cutoffs))  # noqa: B023
-            lost = 1 - shown.rows.sum(dtype=np.float64) / exact.sum(dtype=np.float64)
-            largest = abs(shown.rows - exact).max()
-            print(f"{name:<30} {case.name:<26} {seconds:8.4f} {lost:12.2e} {largest:22.2e}", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -166,7 +145,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cases = [room_case(count) for count in options.points]
     cases += [capture_case(options.capture)] if options.capture else []
     print_kernel(cases)
-    print_cutoffs(cases[-1:])
 
 
 if __name__ == "__main__":
