@@ -129,6 +129,13 @@ def vase(rng: Random) -> Item:
     return Item("vase", (lathe([(r * radius, z * height) for r, z in profile], (0, 0, 0), paint(rng, 0.45)),))
 
 
+def ball(radius: float, rings: int, material: Material) -> Item:
+    """A ball, of so many rings from pole to pole."""
+    angle = np.linspace(-np.pi / 2, np.pi / 2, rings)
+    profile = [(radius * np.cos(a), radius * (1 + np.sin(a))) for a in angle]
+    return Item("ball", (lathe(profile, (0, 0, 0), material),))
+
+
 def standing_book(rng: Random) -> Item:
     """Thick upright volume, spine to the front."""
     size = (rng.uniform(0.05, 0.08), rng.uniform(0.17, 0.2), rng.uniform(0.24, 0.29))

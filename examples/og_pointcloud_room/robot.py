@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud_room.furniture import CLASS_NAMES, Item
+from og_pointcloud_room.furniture import CLASS_NAMES, Item, ball
 from og_pointcloud_room.raycast import Surfaces
 from og_pointcloud_room.room import Room, furnish
-from og_pointcloud_room.shapes import Material, box, lathe, rotated, rotation_about
+from og_pointcloud_room.shapes import Material, box, rotated, rotation_about
 
 Points = NDArray[np.float64]
 BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
@@ -124,11 +124,9 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
     chair = next(index for index, item in enumerate(room.objects) if item.name == "chair")
     others = tuple(item for index, item in enumerate(room.objects) if index != chair)
     grey = Material((0.4, 0.4, 0.45), (0.3, 0.3, 0.35), (0.1, 0.1, 0.1))
-    angle = np.linspace(-np.pi / 2, np.pi / 2, 12)
-    ball = lathe([(0.2 * np.cos(a), 0.2 + 0.2 * np.sin(a)) for a in angle], (0, 0, 0), grey)
     arrivals = [
         (Item("suitcase", (box((0.4, 0.25, 0.6), (0, 0, 0), grey),)), NEW),
-        (Item("ball", (ball,)), NEW),
+        (ball(0.2, 12, grey), NEW),
         (centered(room.objects[chair]), MOVED),
     ]
     items, taken = [*others, *room.shell], np.full((1, 2), np.inf)

@@ -9,15 +9,15 @@ import numpy as np
 import og_pointcloud as og
 from og_pointcloud_room.capture import looking_at, mask_features
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
-from og_pointcloud_room.furniture import CLASS_NAMES, Item
+from og_pointcloud_room.furniture import CLASS_NAMES, ball
 from og_pointcloud_room.masks import MaskNoise, propose_masks
 from og_pointcloud_room.raycast import Intrinsics, RayCaster, Surfaces
 from og_pointcloud_room.robot import centered, free_floor, ring
 from og_pointcloud_room.room import Room, furnish
-from og_pointcloud_room.shapes import Material, lathe
+from og_pointcloud_room.shapes import Material
 
 NAMES = (*CLASS_NAMES, "ball")
-BALL_RADIUS_M = 0.2
+RED = Material((0.8, 0.15, 0.1), (0.7, 0.1, 0.1), (0.2, 0.2, 0.2))
 INTRINSICS = Intrinsics(320, 240, 230.0)
 FRAMES, DAYS_APART_S = 60, 86_400.0
 
@@ -39,7 +39,7 @@ class TwoDays:
     def __init__(self, seed: int = 0, frames: int = FRAMES) -> None:
         room, rng = furnish(seed), np.random.default_rng([seed, 20])
         self.model = FeatureModel(len(NAMES), rng)
-        self._objects = (*room.objects, _ball())
+        self._objects = (*room.objects, ball(0.2, 24, RED))
         self._looks = [self.model.object_look(rng) for _ in self._objects]
         count, path = len(room.objects), ring(room)
         names = [item.name for item in room.objects]
@@ -70,9 +70,3 @@ class TwoDays:
             camera, masks = INTRINSICS.camera(pose), ids.astype(np.int32) - 1
             made.append(og.Frame(camera, masks, rows, depth, rgb=seen.image, stamp=stamp + number / 3))
         return made
-
-
-def _ball() -> Item:
-    angle, red = np.linspace(-np.pi / 2, np.pi / 2, 24), Material((0.8, 0.15, 0.1), (0.7, 0.1, 0.1), (0.2, 0.2, 0.2))
-    profile = [(BALL_RADIUS_M * np.cos(a), BALL_RADIUS_M * (1 + np.sin(a))) for a in angle]
-    return Item("ball", (lathe(profile, (0, 0, 0), red),))

@@ -111,15 +111,13 @@ def _beside_baselines(
     classes: tuple[int, ...],
 ) -> Row:  # fmt: skip
     vocabulary = read_text_features(folder / WORDS)[0]
-    best: tuple[float, str, NDArray[np.integer]] | None = None
-    for name, labels, _ in baseline_labels(prepared, vocabulary.vectors):
-        called = truth.class_of(labels[at], vocabulary.names)
-        miou = truth.score(called).miou
-        if best is None or miou > best[0]:
-            best = miou, name, called
-    assert best is not None
-    gain = miou_interval(answer.called, truth, answer.xyz, answer.spacing, classes, less=best[2])
-    return replace(row, baseline=best[1], baseline_miou=best[0], gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
+    baselines = baseline_labels(prepared, vocabulary.vectors)
+    called = {name: truth.class_of(labels[at], vocabulary.names) for name, labels, _ in baselines}
+    mious = {name: truth.score(of_baseline).miou for name, of_baseline in called.items()}
+    best = max(mious, key=lambda name: mious[name])
+    gain = miou_interval(answer.called, truth, answer.xyz, answer.spacing, classes, less=called[best])
+    gains = {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
+    return replace(row, baseline=best, baseline_miou=mious[best], **gains)
 
 
 def parsed_settings(changes: Iterable[str]) -> FitSettings:
