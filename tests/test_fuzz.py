@@ -192,7 +192,6 @@ PICTURE = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
 
 
 def _images(folder: Path) -> list[bytes]:
-    cv2 = pytest.importorskip("cv2")
     noise = np.random.default_rng(0).integers(0, 256, (9, 13, 3), np.uint8)
     return [cv2.imencode(ending, noise)[1].tobytes() for ending in (".jpg", ".bmp", ".webp", ".tif", ".png")]
 

@@ -7,7 +7,6 @@ python tests/hard_cases --quick --only votes,needle   # three values of each con
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from hard_cases import find_cases
 from hard_cases.case import Case, Row, run_case
+from og_pointcloud.formats.tables import csv_text
 
 COLUMNS = 4
 FLOOR, TOP = 1e-12, 30.0
@@ -74,17 +74,18 @@ def lines_of(row: Row) -> list[str]:
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:
     """A line a row. note: the text of a refusal, or why a case fails."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        lines = csv.writer(file)
-        lines.writerow(
-            ["name", "family", "kind", "case", "condition", "value", "error", "bound", "naive_error", "holds", "note"]
-        )
-        for row in rows:
-            case = row.case
-            bound = None if case.refusal else case.bound
-            numbers = ["" if value is None else f"{value:.6g}" for value in (row.value, row.error, bound, row.naive)]
-            about = (case.name, case.family, case.kind, case.title, case.condition)
-            lines.writerow([*about, *numbers, row.holds, row.note])
+
+    def line(row: Row) -> dict[str, object]:
+        case, bound = row.case, None if row.case.refusal else row.case.bound
+        numbers = {"value": row.value, "error": row.error, "bound": bound, "naive_error": row.naive}
+        return {
+            "name": case.name, "family": case.family, "kind": case.kind, "case": case.title,
+            "condition": case.condition,
+            **{name: "" if value is None else f"{value:.6g}" for name, value in numbers.items()},
+            "holds": row.holds, "note": row.note,
+        }  # fmt: skip
+
+    path.write_text(csv_text([line(row) for row in rows]), encoding="utf-8")
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:

@@ -84,10 +84,10 @@ def _rotation_matrices(quaternion: NDArray[np.floating]) -> NDArray[np.floating]
     return np.moveaxis(np.array(rows, quaternion.dtype), -1, 0)
 
 
-def unit(rows: NDArray[np.floating], dtype: type = Single) -> NDArray[np.floating]:
+def unit(rows: NDArray[np.floating]) -> NDArray[np.floating]:
     """Rows over the square root of their sum of squares."""
-    rows = rows.astype(dtype)
-    return rows / np.sqrt((rows * rows).sum(axis=1, keepdims=True, dtype=dtype))
+    rows = rows.astype(Single)
+    return rows / np.sqrt((rows * rows).sum(axis=1, keepdims=True))
 
 
 def cosines(a: NDArray[np.floating], b: NDArray[np.floating], dtype: type = Single) -> NDArray[np.floating]:
