@@ -109,13 +109,6 @@ def test_the_smallest_mask_and_none_at_all(encoder):
         encoder.embed(image, masks[:, :20])
 
 
-def test_the_order_of_masks_does_not_matter(encoder):
-    random = np.random.default_rng(1)
-    image = random.integers(0, 256, (64, 64, 3)).astype(np.uint8)
-    masks = random.uniform(size=(4, 64, 64)) < 0.2
-    np.testing.assert_allclose(encoder.embed(image, masks)[::-1], encoder.embed(image, masks[::-1]), atol=1e-6)
-
-
 def test_a_model_without_patches_is_refused(tmp_path):
     make_capture(tmp_path / "c", 1)
     with pytest.raises(OgPointcloudError, match=r"encoder 'demo' only has vectors of whole crops; .*crops"):

@@ -387,16 +387,6 @@ def test_a_fit_without_an_instance_says_so() -> None:
     assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])
 
 
-def test_prepare_gives_what_later_stages_need(known: Known) -> None:
-    prepared = prepare(known.scene)
-    n = len(known.truth)
-    assert prepared.table.weights.shape == (8 * BOXES, n)
-    assert prepared.table.outside.shape == prepared.table.exposure.shape == (8, n)
-    assert len(prepared.surface.gaussians) == len(prepared.surface.neighborhood.spacing) == n
-    pixels = np.concatenate([np.bincount(view.mask_map()[view.mask_map() >= 0]) for view in known.scene.views])
-    np.testing.assert_allclose(prepared.table.mask_pixels.sum(), pixels.sum(), rtol=0.05)
-
-
 def test_progress_of_training_says_nothing_without_a_terminal(capsys):
     with Journal(progress=True).bars() as report:
         for name in ("features", "codebook"):

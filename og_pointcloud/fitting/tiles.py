@@ -422,10 +422,9 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     table = shown.table(cloud, sample)
     votes = view_votes(table)
     groups = group_masks(table, settings.grouping)
-    around = neighborhood(cloud.points.xyz[sample], settings.geometry)
-    rgb = cloud.points.rgb
-    rgb = None if rgb is None else rgb[sample]
-    groups, judged = assign_and_mark_spanning(table, votes, groups, around, settings, rgb)
+    points = cloud.points.take(sample)
+    around = neighborhood(points.xyz, settings.geometry)
+    groups, judged = assign_and_mark_spanning(table, votes, groups, around, settings, points.rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     # Groups without a sure point in the sample have rate 0: the tiles know more about these.
@@ -456,8 +455,7 @@ def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSe
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0, missed_chance=0.0)
     votes, looks = view_votes(table), grouped.looks
-    rgb = cloud.points.rgb
-    rgb = None if rgb is None else rgb[cloud.members[tile]]
+    rgb = cloud.points.take(cloud.members[tile]).rgb
     state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.scene)
     ids = by_look(votes, state.instance_ids, looks)
     # Points of the margin helped to decide; they belong to another tile, and are counted there.
