@@ -25,7 +25,7 @@ from og_pointcloud.fitting.learned.instance_features import read_features
 from og_pointcloud.fitting.learned.paper import ADAM_EPSILON, LATE_STEP, STEPS, view_losses
 from og_pointcloud.fitting.learned.rendered_views import RenderedView, RenderedViews
 from og_pointcloud.kernels import njit
-from og_pointcloud.rendering.splatting import ALPHA_MAX, CUTOFFS, LOW_PASS, Gaussians, binned_splats
+from og_pointcloud.rendering.splatting import ALPHA_MAX, LOW_PASS, Gaussians, binned_splats
 from og_pointcloud.settings import PaperSettings
 
 OPACITY_RATE, SIZE_RATE = 2e-3, 4e-4
@@ -101,7 +101,7 @@ def shape_gradient(
     view: of a source of this one view. Cut-offs of the blending have no gradient.
     """
     gaussians, camera = source.gaussians, source.views[0].camera
-    splats, *_ = binned_splats(gaussians, camera, source.near, None, CUTOFFS)
+    splats, *_ = binned_splats(gaussians, camera, source.near, None)
     found = np.zeros((2, len(source.known)))
     sparse = view.weights.indptr, view.weights.indices, view.weights.data
     shown, place = source.known, np.zeros(len(gaussians), np.int64)

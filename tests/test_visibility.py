@@ -24,7 +24,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering import splatting
-from og_pointcloud.rendering.splatting import Cutoffs, Gaussians, render, view_weights
+from og_pointcloud.rendering.splatting import Gaussians, render, view_weights
 from og_pointcloud.scene import Camera, Points, View
 
 NEAR = 0.25
@@ -173,8 +173,8 @@ def test_splats_that_are_passed_over_would_show_in_no_pixel(off_axis: float):
     intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
     seen_by = view.world_to_camera, intrinsics, (view.width, view.height), NEAR
     splats, area = splatting._records(n), np.zeros(n)
-    shows = splatting._project(np.arange(n), shapes, seen_by, Cutoffs(), splats, area) != splatting.CULLED
-    borders = splatting._frustum_planes(seen_by, Cutoffs())
+    shows = splatting._project(np.arange(n), shapes, seen_by, splats, area) != splatting.CULLED
+    borders = splatting._frustum_planes(seen_by)
     looked_at = splatting._in_frustum(*shapes[:2], splatting._boxes(*shapes[:2]), borders)
     assert shows.sum() > 500
     assert looked_at[shows].all()
@@ -254,18 +254,6 @@ def test_a_pixel_stops_before_its_transmittance_falls_below_the_limit() -> None:
     weights = pixel_weights(TWENTY_IN_A_ROW, camera(1, 1), NEAR).toarray().ravel()
     np.testing.assert_allclose(weights[:4], 0.9 * 0.1 ** np.arange(4), rtol=1e-3)
     assert (weights[4:] == 0).all()  # the fifth would leave 1e-5
-
-
-def test_cutoffs_leave_out_what_they_say() -> None:
-    view, ids = camera(5, 5, 10.0, fy=10.0), np.arange(25, dtype=np.int32).reshape(5, 5)
-    shown = view_weights(DOT, view, ids, 25, NEAR, cutoffs=Cutoffs(alpha_min=1 / 32)).rows.toarray()[:25]
-    assert (shown.reshape(5, 5) > 0).astype(int).tolist() == [
-        [0] * 5, [0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0], [0] * 5
-    ]  # fmt: skip
-    one = camera(1, 1), np.zeros((1, 1), np.int32), 1, NEAR
-    weights = view_weights(TWENTY_IN_A_ROW, *one, cutoffs=Cutoffs(transmittance_min=1e-2)).rows.toarray()[0]
-    np.testing.assert_allclose(weights[:2], [0.9, 0.09], rtol=1e-3)
-    assert (weights[2:] == 0).all()
 
 
 @pytest.mark.parametrize(("opacity", "size"), [(0.02, 1), (0.9, 20)])

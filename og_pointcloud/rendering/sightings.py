@@ -23,7 +23,6 @@ from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.splatting import (
     BATCH,
     CULLED,
-    CUTOFFS,
     SPLAT,
     TILE,
     Gaussians,
@@ -97,18 +96,17 @@ def openness(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not selected; and its place u, v in
     the image, pixels. Light is followed through the centers of pixels."""
-    binned = binned_splats(gaussians, camera, near, thickness, CUTOFFS)
+    binned = binned_splats(gaussians, camera, near, thickness)
     n = len(gaussians)
     selected = np.ones(n, np.bool_) if selected is None else selected
     open_, u, v = (np.zeros(n, np.float32) for _ in range(3))
     size = np.array([camera.width, camera.height])
-    log2_alpha_min = np.float32(np.log2(CUTOFFS.alpha_min))
-    _trace_openness(binned, size, selected, log2_alpha_min, get_num_threads(), (open_, u, v))
+    _trace_openness(binned, size, selected, get_num_threads(), (open_, u, v))
     return open_, u, v
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _trace_openness(binned, size, selected, log2_alpha_min, workers, seen):  # noqa: ANN001, ANN202
+def _trace_openness(binned, size, selected, workers, seen):  # noqa: ANN001, ANN202
     """Writes openness and pixels, tile by tile: only the members of a center's tile can hide it.
 
     Light falls through the splats of a tile from front to back. A point is read off when all that lies before its
@@ -140,7 +138,7 @@ def _trace_openness(binned, size, selected, log2_alpha_min, workers, seen):  # n
                             batch[k % BATCH] = splats[members[k]]
                     if not batch[drawn % BATCH]["depth"] < surface[q]:
                         break
-                    attenuate(batch[drawn % BATCH], left, top, log2_alpha_min, light)
+                    attenuate(batch[drawn % BATCH], left, top, light)
                     drawn += 1
                 s = splats[of_tile[q]]
                 transmittance = light[(int(s.v) - top) * TILE + int(s.u) - left]

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,13 @@ LOW_PASS = 0.3
 """Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below this alpha are dropped (3DGS)."""
-LOG2_E = np.log2(np.e)
+LOG2_ALPHA_MIN, LOG2_E = np.log2(ALPHA_MIN), np.log2(np.e)
 ALPHA_MAX = 0.99
 """Alpha is clamped to this (3DGS)."""
 TRANSMITTANCE_MIN = 1e-4
 """A pixel stops before the splat that would bring its transmittance below this (3DGS)."""
+LEAST_LOG_ALPHA, LEAST_LIGHT = np.float32(LOG2_ALPHA_MIN), np.float32(0.99999 * TRANSMITTANCE_MIN)
+"""Of a row of pixels. The light is lower by more than rounding: four splats of opacity 0.9 leave just 3DGS's limit."""
 FRUSTUM_MARGIN = 0.3
 """Centers beyond the image by more than this share of the half field of view are clamped when the projection is
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
@@ -52,15 +54,6 @@ NEAR_SHARE = 0.02
 """The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
 
 
-class Cutoffs(NamedTuple):
-    """What blending leaves out, by default as in 3DGS. Larger values are faster and lose weight: alphas below
-    ``alpha_min`` are dropped, and a pixel stops before its transmittance would fall below ``transmittance_min``."""
-
-    alpha_min: float = ALPHA_MIN
-    transmittance_min: float = TRANSMITTANCE_MIN
-
-
-CUTOFFS = Cutoffs()
 Binned = tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int32], int]
 """(splats, starts, members, columns of tiles); members[starts[t] : starts[t + 1]] are rows of splats, nearest first."""
 
@@ -139,14 +132,13 @@ def view_weights(
     id_count: int,
     near: float,
     thickness: NDArray[np.float32] | None = None,
-    cutoffs: Cutoffs = CUTOFFS,
 ) -> ViewWeights:
     """Blending weight of every Gaussian summed over the pixels of every id of one view.
 
     ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `mask_table.mask_table`.
     Splats are blended by (float32 depth, index), so that equal depths have one order.
     """
-    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness, cutoffs)
+    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness)
     data, indices, indptr = _merge(rows, cols, weights, first, counts, id_count + 2, len(gaussians))
     border, n = indptr[-2], len(gaussians)
     return ViewWeights(
@@ -168,16 +160,15 @@ def _entries(
     id_count: int,
     near: float,
     thickness: NDArray[np.float32] | None,
-    cutoffs: Cutoffs = CUTOFFS,
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), where tile t has the entries
     first[t] : first[t] + counts[t]; and the area of each splat."""
     area = np.zeros(len(gaussians))
-    binned = binned_splats(gaussians, camera, near, thickness, cutoffs, area)
+    binned = binned_splats(gaussians, camera, near, thickness, area)
     masks = np.where(ids < 0, id_count, ids).astype(np.int32)
     bounds = _entry_bounds(binned, masks, id_count)
     first = np.concatenate([[0], np.cumsum(bounds)])
-    rows, cols, weights, counts = _composite(binned, masks, id_count, first, cutoffs, get_num_threads())
+    rows, cols, weights, counts = _composite(binned, masks, id_count, first, get_num_threads())
     return (rows, cols, weights, first[:-1], counts), area
 
 
@@ -186,7 +177,6 @@ def binned_splats(
     camera: Camera,
     near: float,
     thickness: NDArray[np.float32] | None,
-    cutoffs: Cutoffs,
     area: NDArray[np.float64] | None = None,
 ) -> Binned:
     """The splats of an image by tile. area: (n,), to be filled in for Gaussians with a splat; None: not computed."""
@@ -195,16 +185,14 @@ def binned_splats(
     shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
-    rows = np.flatnonzero(
-        _in_frustum(gaussians.xyz, gaussians.scale, gaussians.boxes, _frustum_planes(seen_by, cutoffs))
-    )
+    rows = np.flatnonzero(_in_frustum(gaussians.xyz, gaussians.scale, gaussians.boxes, _frustum_planes(seen_by)))
     splats = _records(len(rows))
-    order = ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
+    order = ascending(_project(rows, shapes, seen_by, splats, area))
     # In order of depth in memory too: a tile's splats are then read from front to back.
     splats = _in_order(splats, order, _records(len(order)))
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
-    starts, members = _bin(splats, columns, tiles, cutoffs, get_num_threads())
+    starts, members = _bin(splats, columns, tiles, get_num_threads())
     return splats, starts, members, columns
 
 
@@ -272,7 +260,7 @@ def _boxes(xyz, scale):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _frustum_planes(seen_by, cutoffs):  # noqa: ANN001, ANN202
+def _frustum_planes(seen_by):  # noqa: ANN001, ANN202
     """(5, 5): the near plane and the four borders of an image. Where ``a x + b y + c z + d + e * longest axis`` of a
     row (a, b, c, d, e) is not above 0, a circle that encloses the splat's ellipse lies beyond it."""
     pose, (fx, fy, cx, cy), size, near = seen_by
@@ -280,7 +268,7 @@ def _frustum_planes(seen_by, cutoffs):  # noqa: ANN001, ANN202
     high_x, high_y = clamped_slopes(np.inf, np.inf, (fx, fy, cx, cy), size)
     # Standard deviations from the center to where an opaque splat's alpha is the least; a tenth more for poses and
     # quaternions that are not quite of length one. Times depth, the radius is own * longest axis + blur * depth.
-    reach = 1.1 * np.sqrt(-2 * np.log(cutoffs.alpha_min))
+    reach = 1.1 * np.sqrt(-2 * np.log(ALPHA_MIN))
     own_x = reach * fx * np.sqrt(1 + max(abs(low_x), abs(high_x)) ** 2)
     own_y = reach * fy * np.sqrt(1 + max(abs(low_y), abs(high_y)) ** 2)
     blur = reach * np.sqrt(LOW_PASS) + 1
@@ -317,7 +305,7 @@ def _in_frustum(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
+def _project(rows, shapes, seen_by, splats, area):  # noqa: ANN001, ANN202
     """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
     weight in pixels if nothing were in front, or (0,) if not needed; returns keys (rows,) uint32: the bits of the
     float32 depth, which sort as depths do since these are positive; CULLED for those without a pixel.
@@ -328,14 +316,14 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
     for i in prange(len(rows)):
         g = rows[i]
         depth, tx, ty = depth_and_slopes(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
-        if not depth > near or not opacity[g] > cutoffs.alpha_min:
+        if not depth > near or not opacity[g] > ALPHA_MIN:
             continue
         jx, jy = clamped_slopes(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale, rotation, g, pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
         # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
         peak = np.log2(sigma)
-        reach = 2.0 / LOG2_E * (peak - np.log2(cutoffs.alpha_min))
+        reach = 2.0 / LOG2_E * (peak - LOG2_ALPHA_MIN)
         rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
         x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
         y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
@@ -347,7 +335,7 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
         s.peak, s.depth, s.surface = peak, depth, depth - thickness[g]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
         if len(area):
-            area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
+            area[g] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)  # the integral of alpha over that ellipse
         keys[i] = np.float32(depth).view(np.uint32)
     return keys
 
@@ -415,9 +403,9 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
+def _bin(splats, columns, tiles, bands):  # noqa: ANN001, ANN202
     """Members of every tile, of splats in order of depth: tile t holds members[starts[t]:starts[t + 1]]."""
-    tile_rows, log2_alpha_min = tiles // columns, np.log2(cutoffs.alpha_min)
+    tile_rows = tiles // columns
     # The tile ranges side by side: every band reads all of them, twice.
     ranges = np.empty((len(splats), 4), np.int32)
     for i in prange(len(splats)):
@@ -430,7 +418,7 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_alpha_min)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1])
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     # Second pass: the splats themselves, in order of depth as they come.
@@ -441,7 +429,7 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_alpha_min)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1])
                 for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = i
@@ -450,14 +438,14 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tiles_of_row(splats, place, row, begin, end, log2_alpha_min):  # noqa: ANN001, ANN202
+def _tiles_of_row(splats, place, row, begin, end):  # noqa: ANN001, ANN202
     """The columns of tiles, of those that its box touches, that a splat's ellipse touches in a row of tiles."""
     if end - begin <= 2:  # the box will do
         return begin, end
     s = splats[place]
     # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
     # within the row of tiles where it comes nearest to that; its left end is the mirror image.
-    room, across, down = np.float64(s.peak) - log2_alpha_min, np.float64(s.across), np.float64(s.down)
+    room, across, down = np.float64(s.peak) - LOG2_ALPHA_MIN, np.float64(s.across), np.float64(s.down)
     slant = s.shear * across
     far = -slant * np.sqrt(room / down / (down + slant * slant))
     low = max(row * TILE + 0.5 - s.v, -np.sqrt(room / down))
@@ -506,7 +494,7 @@ def _entry_bounds(binned, masks, id_count):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN001, ANN202
+def _composite(binned, masks, id_count, first, workers):  # noqa: ANN001, ANN202
     """Blend every tile front to back and sum each splat's weights by mask; entries of tile t start at first[t].
 
     Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
@@ -524,8 +512,6 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
         light, surface, shown = tile_buffer(), tile_buffer(), tile_buffer()
         runs = np.empty((TILE, TILE), np.uint8)
         batch = np.empty(BATCH, SPLAT)
-        # Lower by more than rounding: four splats of opacity 0.9 leave just the limit of 3DGS.
-        least = np.float32(np.log2(cutoffs.alpha_min)), np.float32(0.99999 * cutoffs.transmittance_min)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
             ids = masks[top : top + TILE, left : left + TILE]
@@ -537,7 +523,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
                     batch[k] = splats[members[begin + k]]
                 for k in range(count):
                     s = batch[k]
-                    weight, through = _blend(s, left, top, least, light, surface, shown)
+                    weight, through = _blend(s, left, top, light, surface, shown)
                     if weight == 0.0:
                         continue
                     box = _clip_box(s, left, top)
@@ -552,7 +538,7 @@ def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN00
                     if through > 0.0:
                         rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
                         entry += 1
-                if not has_light(light, least[1]):
+                if not has_light(light, LEAST_LIGHT):
                     break
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts
@@ -585,9 +571,9 @@ def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _alpha_of_row(s, left, row, log2_alpha_min):  # noqa: ANN001, ANN202
+def _alpha_of_row(s, left, row):  # noqa: ANN001, ANN202
     """Alpha of a splat in a tile's row of pixels, clamped at both ends as in 3DGS; 0 where it does not reach."""
-    least = broadcast(log2_alpha_min)
+    least = broadcast(LEAST_LOG_ALPHA)
     # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the center.
     dy = row + 0.5 - s.v
     distance = (iota() - broadcast(np.float32(s.u - s.shear * dy - left - 0.5))) * broadcast(s.across)
@@ -598,10 +584,9 @@ def _alpha_of_row(s, left, row, log2_alpha_min):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blend(s, left, top, least, light, surface, shown):  # noqa: ANN001, ANN202
+def _blend(s, left, top, light, surface, shown):  # noqa: ANN001, ANN202
     """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and its part shown through a surface.
 
-    least: log2 of the least alpha that counts, and the least light of a pixel that is not finished.
     light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
     transmittance below a half. shown: set to the weights in the rows of its box.
     """
@@ -609,11 +594,11 @@ def _blend(s, left, top, least, light, surface, shown):  # noqa: ANN001, ANN202
     depth, near_side = broadcast(s.depth), broadcast(s.surface)
     weight, through = none, none
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
-        alpha = _alpha_of_row(s, left, top + y, least[0])
+        alpha = _alpha_of_row(s, left, top + y)
         # Weight = transmittance before the splat times alpha, except in pixels that this splat would finish.
         before = load(light, y * TILE)
         after = before * (full - alpha)
-        goes_on = after >= broadcast(least[1])  # also where it is not covered and not finished
+        goes_on = after >= broadcast(LEAST_LIGHT)  # also where it is not covered and not finished
         here = select(goes_on, before * alpha, none)
         store(light, y * TILE, select(goes_on, after, none))
         # The splat at which the transmittance falls below a half is the pixel's surface.
@@ -627,11 +612,11 @@ def _blend(s, left, top, least, light, surface, shown):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def attenuate(s, left, top, log2_alpha_min, light):  # noqa: ANN001, ANN201
+def attenuate(s, left, top, light):  # noqa: ANN001, ANN201
     """Take from each pixel's light what a splat absorbs: `_blend` without the weights."""
     full = broadcast(ONE)
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
-        store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y, log2_alpha_min)))
+        store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y)))
 
 
 @njit(cache=True, nogil=True)
