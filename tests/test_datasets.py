@@ -70,24 +70,15 @@ def write_replica(folder: Path):
     return [f"frame{index:06d}" for index in range(COUNT)], SIZE
 
 
-LAYOUTS = {
-    "scannet": (write_scannet, OURS),
-    "seven_scenes": (write_seven_scenes, OURS),
-    "replica": (write_replica, OURS),
-}
-
-
-@pytest.fixture(params=LAYOUTS)
+@pytest.fixture(params=[write_scannet, write_seven_scenes, write_replica])
 def dataset(request, tmp_path):
-    write, lens = LAYOUTS[request.param]
     folder = tmp_path / "set" / "scene"
     folder.mkdir(parents=True)
-    names, size = write(folder)
-    return folder, names, size, lens
+    return folder, *request.param(folder)
 
 
 def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
-    folder, names, size, _ = dataset
+    folder, names, size = dataset
     write_masks(folder, names, size)
     scene = read_capture(folder)
     assert [view.name for view in scene.views] == names
@@ -103,14 +94,13 @@ def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
 
 
 def test_depth_of_a_view_is_given_at_the_pixels_of_its_image(dataset):
-    folder, names, size, lens = dataset
-    scale = size[0] / WIDTH
+    folder, names, size = dataset
     posed = read_poses(folder)
     files = depth_files(folder, posed)
     image = files[names[2]].read()
     depth = resampled(image.depth, image.camera, posed.images[2].camera)
     assert depth.shape == (size[1], size[0])
-    intrinsics = (260.0, 262.0, 158.5, 121.5) if scale == 2 else lens
+    intrinsics = OURS if size == SIZE else (260.0, 262.0, 158.5, 121.5)
     truth, _ = look(room_poses(COUNT)[2], size=size, intrinsics=intrinsics)
     measured = depth > 0
     assert measured.mean() > 0.9

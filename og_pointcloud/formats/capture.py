@@ -214,7 +214,9 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
         return tuple(stems)
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
-        raise SceneError(f"two images have the path '{twice}'; expected unique ones: rename or leave out one of them")
+        raise SceneError(
+            f"two images have the path '{twice:.80}'; expected unique ones: rename or leave out one of them"
+        )
     paths = [path.lstrip("/") for path in paths]
     shared = posixpath.commonpath([posixpath.dirname(path) for path in paths])
     names = [path[len(shared) :].lstrip("/") for path in paths]
