@@ -198,15 +198,6 @@ def equal_depths(threads: float) -> Answer:
         numba.set_num_threads(every)
 
 
-@agrees(WEIGHTS)
-def shuffled_points() -> Answer:
-    """The same Gaussians in another order have the same weights."""
-    gaussians, order = scatter(200), np.random.default_rng(1).permutation(200)
-    parts = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity
-    shuffled = Gaussians(*(part[order] for part in parts))
-    return Answer(dense_weights(shuffled, camera()), reference_pixel_weights(gaussians, camera(), NEAR)[..., order])
-
-
 def _read(
     gaussians: Gaussians, rotation: np.ndarray | None = None, log_scale: np.ndarray | None = None,
     logit: np.ndarray | None = None,
