@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
+from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.capture import read_capture
@@ -98,6 +98,7 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
         xyz=np.concatenate([a.xyz[stays], b.xyz[adds]]),
         instance_ids=ids,
         instances=joined(a.instances, b.instances, ids_of_later, ids),
+        feature_space=b.feature_space if a.feature_space == UNKNOWN_SPACE else a.feature_space,
         rgb=None if a.rgb is None and b.rgb is None else both(*colors),
         certainty=both(a.certainty, b.certainty),
         provenance=record.added_to(a.provenance),
