@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The light tests under the oldest and the newest Python that are promised, with the base install alone, where these are
-# to be had: as python3.X, or from pyenv. Made once in .venv-3.X; a Python that is not here is said and skipped.
+# The light tests with the base install alone: under the oldest Python that is promised with the oldest packages that
+# pyproject.toml allows, and under the newest Python with the newest packages. Pythons are python3.X, or pyenv's; one
+# that is not here is said and skipped. Environments are made once, in .venv-3.X.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -16,20 +17,28 @@ find_python() {
     done
 }
 
+oldest=("numpy==1.24.*" "onnxruntime==1.17.*" "onnx==1.15.*" "tokenizers==0.20.*" "pytest>=8")
+newest=(numpy onnxruntime onnx tokenizers pytest)
+
 for version in 3.10 3.13; do
+    packages=("${newest[@]}")
+    if [ "$version" = 3.10 ]; then
+        packages=("${oldest[@]}")
+    fi
     python=$(find_python "$version")
     if [ -z "$python" ]; then
         echo "other_pythons: no Python $version here: skipped" >&2
         continue
     fi
     environment=.venv-$version
-    if [ ! -e "$environment/made" ]; then
+    made="$environment/made-with-${packages[0]}"  # another numpy: made anew
+    if [ ! -e "$made" ]; then
         "$python" -m venv --clear "$environment"
-        if ! "$environment/bin/pip" install -q "numpy>=1.24" "onnxruntime>=1.17" "pytest>=8" "onnx>=1.15" "tokenizers>=0.20"; then
+        if ! "$environment/bin/pip" install -q "${packages[@]}"; then
             echo "other_pythons: nothing can be installed for Python $version: skipped" >&2
             continue
         fi
-        touch "$environment/made"
+        touch "$made"
     fi
     echo "other_pythons: $("$environment/bin/python" --version)"
     PYTHONPATH=.:export:plugins:examples "$environment/bin/python" -m pytest -q --noconftest -m "not slow" \
