@@ -139,6 +139,7 @@ def test_a_drawing_as_like_its_photograph_as_photographs_of_the_same_is_right(ow
     """Whatever it loses against others: of views nearly alike a third of the comparisons go the other way."""
     found = Comparison(0.62, own, 0.75, 0.1, 16, "correlation")
     monkeypatch.setattr(Photographs, "fit", lambda self, cameras: found)
+    monkeypatch.setattr("og_pointcloud.checking.check.best_conversion", lambda photographs: ())
     assert verdicts(check_poses(tiled_room(**SMALL)))["poses"] == verdict
 
 
