@@ -255,6 +255,15 @@ def test_only_what_changed_is_read_again(folder, monkeypatch):
         assert again.find(word, top=100).to_json() == fresh.find(word, top=100).to_json()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a name")
+def test_a_file_whose_name_is_no_text_is_left_out(folder):
+    indexed(folder, {"a": scene(["desk"])})
+    shutil.copy(folder / "a.ogpc", os.fsencode(folder) + b"/\xff.ogpc")
+    changes = index(folder, folder.parent / "atlas", progress=False)
+    assert changes.left_out == (("\udcff", "its name has bytes that are not UTF-8: rename the file or folder"),)
+    assert changes.unchanged == 1
+
+
 def test_scenes_are_judged_as_long_as_their_kin_knows_enough_words(folder):
     words = {f"word{k}": row for k, row in enumerate(unit_rows(60, WIDTH, seed=2))}
     clouds = {

@@ -11,6 +11,7 @@ vectors for the same words have two encoders (two families), and words of one ar
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -75,7 +76,8 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
                     (replaced if name in known else added).append(name)
             except (OgPointcloudError, OSError) as error:  # one bad file does not affect the others
                 left_out.append((name, str(error)))
-                atlas.remove(name)
+                if name in known:
+                    atlas.remove(name)
         removed = sorted(set(known) - set(files))
         for name in removed:
             atlas.remove(name)
@@ -94,6 +96,8 @@ def _add_file(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> 
     """Add a .ogpc file to the atlas; False if only its date is new, not its content."""
     if not file.is_file():
         raise OgPointcloudError(f"{file} is not a file; expected a .ogpc file")  # a device or a pipe never ends
+    if os.fsencode(name).decode(errors="ignore") != name:
+        raise OgPointcloudError("its name has bytes that are not UTF-8: rename the file or folder")
     state = file.stat()
     digest = blake2b(file.read_bytes(), digest_size=16).hexdigest()
     if known is not None and known.digest == digest:
