@@ -94,8 +94,9 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
             journal.leave_out(LeftOut.SECOND_LEVEL)
     with journal.stage("matching"):
         # A mask's P_j of Eq. 5 is the mean of what it shows, an instance's M_i its leaf's center.
-        shown = mask_means(table, learned.features)
-        evidence = visible_evidence(table, book.leaf, book.leaf_centers, shown)
+        shown = np.asarray(table.weights.sum(axis=1), np.float64)[:, None]
+        means = (table.weights @ learned.features) / np.where(shown > 0, shown, 1)
+        evidence = visible_evidence(table, book.leaf, book.leaf_centers, means)
         matching = match_masks(table, book.leaf, evidence, settings.matching)
     if not settings.matching.settle:
         return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
@@ -176,12 +177,6 @@ LABELLERS: dict[str, Labeller] = {"grouping": grouping, "fast": fast, "paper": p
 """By `FitSettings.mode`. Grouping is the default on every scene, and what "auto" stands for: over the zoo's half for
 choosing, fast was better by more than 0.01 on one of 32 scenes, and neither agreement with masks nor reliability told
 which one."""
-
-
-def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(masks, width): the mean instance feature that each mask shows; zero where it shows nothing."""
-    shown = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
-    return (table.weights @ features) / np.where(shown > 0, shown, 1)
 
 
 def _leaves_decided_by_views(
