@@ -425,8 +425,9 @@ def test_labels_that_cannot_be_asked(scene, labels, error, says):
         og.segment(scene, labels)
 
 
-def test_words_without_any_vocabulary():
-    bare = replace(CLOUDS["room"], vocabulary=None)
+@pytest.mark.parametrize("words", [None, Vocabulary((), np.zeros((0, WIDTH), np.float32))])
+def test_words_without_any_vocabulary(words):
+    bare = replace(CLOUDS["room"], vocabulary=words)
     with pytest.raises(OgPointcloudError, match="'chair' is not among the 0 known words: pass"):
         og.segment(bare, ["chair"])
     with pytest.raises(OgPointcloudError, match=r"no labels are given, .*--labels chair,table; pass"):

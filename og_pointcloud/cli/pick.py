@@ -45,9 +45,8 @@ def run(arguments: argparse.Namespace) -> None:
         hit = og.pick(scene, camera, common.numbers(arguments.pixel, "--pixel", 2))
     else:
         hit = og.pick(scene, common.numbers(arguments.xyz, "--xyz", 3))
-    words = []
-    if hit.found and (scene.vocabulary or arguments.text_features):
-        words = hit.words(text_features=arguments.text_features)
+    known = scene.known_words(None, arguments.text_features)
+    words = hit.words(known) if hit.found and known.names else []
     mask = None
     if arguments.output and camera is not None:
         mask = hit.mask(camera)

@@ -43,7 +43,7 @@ def resolve_labels(
     another space and for vectors that cannot be compared.
     """
     # In order of look-up: the caller's words come before the scene's.
-    sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
+    sources = [source for source in (_of_space(text_features, feature_space), own_words) if source and source.names]
     if labels is None:
         if not sources:
             how = "" if find_encoder(feature_space, carried) else f"; {_ways(feature_space)}"

@@ -178,9 +178,10 @@ class OgPlotter:
     def _answer(self, hit: Pick) -> str:
         if not hit.found:
             return str(hit)
-        if self._labels is None and not hit.scene.vocabulary:
+        words = hit.scene.known_words(self._labels)
+        if not words.names:
             return f"{hit}\n(the scene has no words of its own: pass labels)"
-        ranked = hit.words(self._labels)[: self._count]
+        ranked = hit.words(words)[: self._count]
         lines = [f"{score:5.2f}  {word}" for word, score in ranked] or ["no mask gave it a feature: unknown"]
         return "\n".join([str(hit), *lines])
 
