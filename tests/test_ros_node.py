@@ -111,18 +111,15 @@ def test_setting_the_parameter_answers(node):
     assert names(node) == [WORDS, ["plum"]]
 
 
-def test_nothing_is_done_for_nobody(node, scene, monkeypatch):
+def test_nothing_is_done_for_nobody_and_one_listener_is_enough(node, scene):
     for publisher in node.publishers.values():
         publisher.listeners = 0
-    calls = []
-    monkeypatch.setattr(node, "_labeller", lambda *now: calls.append(now))
+    calls, labeller = [], node._labeller
+    node._labeller = lambda *now: calls.append(now)
     send(node, "~/input/points", cloud(scene))
-    assert calls == []
-    assert sent(node) == []
-
-
-def test_one_listener_is_enough(node, scene):
-    node.publishers["~/output/points"].listeners = 0
+    assert (calls, sent(node)) == ([], [])
+    node._labeller = labeller
+    node.publishers["~/output/detections"].listeners = 1
     send(node, "~/input/points", cloud(scene))
     assert len(sent(node, "~/output/detections")) == 1
 

@@ -7,7 +7,7 @@ surface: points behind it are hidden.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 
@@ -157,7 +157,15 @@ class GrowingMap:
         if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
             raise SceneError(f"a pose is given for frame {strange[0]!r}; expected the frame's stamp, a number")
         cameras = {float(t): Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose)) for t, pose in poses.items()}
-        self._warn_of_strange(cameras.keys())
+        known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
+        strange = [stamp for stamp in cameras if stamp not in known and stamp >= self.remembered_since]
+        some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
+        if strange and len(strange) == len(cameras):  # seconds instead of nanoseconds, say
+            there = f", {min(known):.15g} to {max(known):.15g}" if known else ""
+            raise SceneError(f"the poses have stamps {some}; expected those of integrated frames{there}")
+        if strange:
+            what = f"{len(strange)} of {len(cameras)} poses are for frames that were not integrated: {some}"
+            warnings.warn(what, stacklevel=3)
         return cameras
 
     def correct(self, cameras: Mapping[float, Camera]) -> None:
@@ -184,18 +192,6 @@ class GrowingMap:
     def remembered_since(self) -> float:
         """Not all frames before this stamp are remembered."""
         return min(self.recent) if len(self.recent) == RECENT_FRAMES else -np.inf
-
-    def _warn_of_strange(self, stamps: Collection[float]) -> None:
-        """Warn of stamps that belong to no frame; SceneError if all do: seconds instead of nanoseconds, say."""
-        known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
-        strange = [stamp for stamp in stamps if stamp not in known and stamp >= self.remembered_since]
-        some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
-        if strange and len(strange) == len(stamps):
-            there = f", {min(known):.15g} to {max(known):.15g}" if known else ""
-            raise SceneError(f"the poses have stamps {some}; expected those of integrated frames{there}")
-        if strange:
-            what = f"{len(strange)} of {len(stamps)} poses are for frames that were not integrated: {some}"
-            warnings.warn(what, stacklevel=4)
 
     def count(self, stamp: float) -> None:
         """One more frame is in."""

@@ -26,7 +26,7 @@ from sensor_msgs.msg import PointCloud2  # pyright: ignore[reportMissingImports]
 from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
 from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[reportMissingImports]
 
-from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, load
+from og_pointcloud.ask.labelled_scene import Segmenter, load
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
@@ -90,7 +90,9 @@ class SegmentNode(PlacedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("og_pointcloud", PARAMETERS, **options)
-        self._scene = self._load()
+        if not (path := self._value("scene")):
+            raise OgPointcloudError("the parameter 'scene' is empty; expected a .ogpc file: -p scene:=/maps/room.ogpc")
+        self._scene = load(path)
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._points = self.create_publisher(PointCloud2, "~/output/points", latest_only(reliable))
         self._detections = self.create_publisher(Detection3DArray, "~/output/detections", latest_only(reliable))
@@ -102,12 +104,6 @@ class SegmentNode(PlacedNode):
         self.add_on_set_parameters_callback(self._on_parameters)
         self._waiting: tuple[Any, float] | None = None
         self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, latest_only(best_effort))
-
-    def _load(self) -> LabelledScene:
-        path = self._value("scene")
-        if not path:
-            raise OgPointcloudError("the parameter 'scene' is empty; expected a .ogpc file: -p scene:=/maps/room.ogpc")
-        return load(path)
 
     def _segmenter(self, labels: Sequence[str]) -> Segmenter:
         return Segmenter(
