@@ -165,13 +165,20 @@ def answers_other_ids(graph: Any) -> None:
 # Text encoders --------------------------------------------------------------------------------------------------------
 
 
-def encoder_with(tokenizer: dict | None = None, graph: bytes | None = None, **manifest: Any) -> dict[str, bytes]:
-    """The files of an encoder with another tokenizer.json or graph, and other entries of its manifest."""
+def encoder_with(
+    tokenizer: dict | None = None,
+    change: Callable[[dict], Any] = lambda _: None,
+    graph: bytes = b"",
+    bank: bytes = b"",
+    **manifest: Any,
+) -> dict[str, bytes]:
+    """The files of an encoder with another tokenizer.json, graph or word bank, other entries of its manifest, and a
+    change of the manifest after its checksums were put right."""
     files = encoder_files(tokenizer=tokenizer)
-    if graph is not None:
-        files["text_encoder.onnx"] = graph
+    files |= {name: data for name, data in (("text_encoder.onnx", graph), ("word_bank.npy", bank)) if data}
     about = json.loads(files.pop("manifest.json")) | manifest
     about["files"] = {name: {"bytes": len(data), "crc32": zlib.crc32(data)} for name, data in files.items()}
+    change(about)
     return {"manifest.json": json.dumps(about).encode(), **files}
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import subprocess
 import sys
 import threading
-import zlib
 from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
+from hostile_files import encoder_with
 from labelled_clouds import room, unit_rows
 from og_pointcloud_export import write_bundle
 from onnx import TensorProto, helper, numpy_helper
@@ -90,21 +89,6 @@ def test_threads_share_an_encoder(encoder, encoder_folder):
     assert all((result == results[0]).all() for result in results.values())
 
 
-def altered(folder, out, change=None, **files):
-    """A copy with some files replaced, manifest changed, and digests put right."""
-    held = {path.name: path.read_bytes() for path in folder.iterdir()} | files
-    manifest = json.loads(held["manifest.json"])
-    for name in manifest["files"]:
-        manifest["files"][name]["crc32"] = zlib.crc32(held[name])
-    if change:
-        change(manifest)
-    held["manifest.json"] = json.dumps(manifest).encode()
-    out.mkdir()
-    for name, data in held.items():
-        (out / name).write_bytes(data)
-    return out
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -127,26 +111,18 @@ def altered(folder, out, change=None, **files):
         (lambda m: m.update(files=[]), "not a usable encoder"),
     ],
 )
-def test_manifests_that_do_not_fit(encoder_folder, tmp_path, change, says):
-    folder = altered(encoder_folder, tmp_path / "e", change)
+def test_manifests_that_do_not_fit(tmp_path, change, says):
+    folder = write_files(tmp_path / "e", encoder_with(change=change))
     with pytest.raises(OgPointcloudError, match=says) as caught:
         read_text_encoder(folder).encode(["cat"])
     assert str(caught.value).startswith(str(folder))
 
 
-def test_a_graph_of_another_width_than_its_manifest_says(encoder_folder, tmp_path):
+def test_a_graph_of_another_width_than_its_manifest_says(tmp_path):
     bank = npy_bytes(np.ones((50, OUT + 1), np.float16))
-    folder = altered(encoder_folder, tmp_path / "e", lambda m: m.update(width=OUT + 1), **{"word_bank.npy": bank})
+    folder = write_files(tmp_path / "e", encoder_with(width=OUT + 1, bank=bank))
     with pytest.raises(OgPointcloudError, match=r"returns float32 \(1, 24\).*make the encoder again"):
         read_text_encoder(folder).encode(["cat"])
-
-
-def graph_with(data, *nodes, **changes):
-    model = onnx.load_from_string(data)
-    model.graph.node.extend(nodes)
-    for name, value in changes.items():
-        getattr(model, name).extend(value)
-    return model
 
 
 def external(model):
@@ -197,7 +173,7 @@ def hidden_constant(model):
 def test_graphs_that_could_do_harm(encoder_folder, tmp_path, change, says):
     model = onnx.load(encoder_folder / "text_encoder.onnx")
     change(model)
-    folder = altered(encoder_folder, tmp_path / "e", **{"text_encoder.onnx": model.SerializeToString()})
+    folder = write_files(tmp_path / "e", encoder_with(graph=model.SerializeToString()))
     with pytest.raises(OgPointcloudError, match=says):
         read_text_encoder(folder)
 
@@ -225,14 +201,11 @@ def test_graphs_of_noise_are_refused_or_harmless(encoder_folder):
     assert passed < 2000
 
 
-def test_files_that_are_damaged_or_too_large(encoder_folder, tmp_path, monkeypatch):
+def test_files_that_are_damaged_or_too_large(tmp_path, monkeypatch):
     for number, (name, data) in enumerate(
         [("tokenizer.json", b"{}"), ("text_encoder.onnx", b""), ("manifest.json", b"[")]
     ):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for path in encoder_folder.iterdir():
-            (folder / path.name).write_bytes(data if path.name == name else path.read_bytes())
+        folder = write_files(tmp_path / str(number), encoder_files() | {name: data})
         with pytest.raises(OgPointcloudError, match="make the encoder again"):
             read_text_encoder(folder)
         (folder / name).unlink()
@@ -240,7 +213,7 @@ def test_files_that_are_damaged_or_too_large(encoder_folder, tmp_path, monkeypat
             read_text_encoder(folder)
     monkeypatch.setitem(read_text_encoder.__globals__["ENCODER"].more, "tokenizer.json", 10)
     with pytest.raises(OgPointcloudError, match="expected at most 10"):
-        read_text_encoder(altered(encoder_folder, tmp_path / "large"))
+        read_text_encoder(write_files(tmp_path / "large", encoder_files()))
 
 
 # Found by feature space
@@ -298,10 +271,9 @@ def test_words_that_a_scene_lacks_are_encoded(encoder, encoder_folder, tmp_path,
     assert set(result.labels[result.labels >= 0]) == {0, 1}
 
 
-def test_a_damaged_encoder_is_not_passed_over(encoder, encoder_folder, tmp_path, monkeypatch):
+def test_a_damaged_encoder_is_not_passed_over(encoder, tmp_path, monkeypatch):
     path = scene_of(encoder, tmp_path / "s.ogpc", ["cat"], unit_rows(9, OUT))
-    folder = altered(encoder_folder, tmp_path / "e")
-    (folder / "text_encoder.onnx").write_bytes(b"torn")
+    folder = write_files(tmp_path / "e", encoder_files() | {"text_encoder.onnx": b"torn"})
     monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(folder))
     with pytest.raises(OgPointcloudError, match="it is damaged or was changed"):
         og.segment(og.load(path), ["lower"])
