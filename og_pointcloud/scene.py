@@ -10,10 +10,10 @@ spacing or shares of the scene extent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +23,7 @@ from og_pointcloud.errors import SceneError
 FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
+Item = TypeVar("Item")
 
 MIN_FOCAL_SHARE = 1e-6
 """Smallest focal length as a share of the image's side: with a shorter one every pixel sees half of the world."""
@@ -405,6 +406,12 @@ def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
     """Largest entry of R R' - 1 for a matrix (3, 3), 0 for orthonormal rows, NaN where it overflows; and det R."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.abs(matrix @ matrix.T - np.eye(3)).max()), float(np.linalg.det(matrix))
+
+
+def evenly(items: Sequence[Item], count: int) -> list[Item]:
+    """At most ``count`` items, spread evenly over the sequence."""
+    rows = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[row] for row in np.unique(rows)]
 
 
 def float32_step(xyz_world: NDArray[np.floating]) -> float:

@@ -14,7 +14,6 @@ from og_pointcloud.formats.fusion import (
     NOISE_TOLERANCE,
     _Voxels,
     doubtful_depth,
-    evenly,
     fuse,
     on_surface,
     survey,
@@ -299,12 +298,6 @@ def test_images_of_one_row_or_column_are_surfaces_along_the_other():
     row = on_surface(DepthImage(depth, camera(POSE, (4, 1), (100.0, 100.0, 2.0, 0.5))), 0.0)
     column = on_surface(DepthImage(depth.T, camera(POSE, (1, 4), (100.0, 100.0, 0.5, 2.0))), 0.0)
     assert row[0].tolist() == column[:, 0].tolist() == [True, True, False, False]
-
-
-def test_evenly_takes_first_and_last():
-    assert evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
-    assert evenly([1, 2], 5) == [1, 2]
-    assert evenly([], 3) == []
 
 
 def test_voxels_are_the_means_of_their_points_however_often_they_are_added_to():

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
-from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.scene import Camera, Points, Scene, View, evenly
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -178,6 +178,12 @@ def test_views_may_come_from_a_generator():
         Scene(scene.points, views[:1] * 2, "letters")  # type: ignore[arg-type]
     with pytest.raises(SceneError, match="the scene has 0 views"):
         Scene(scene.points, iter(()), "letters")  # type: ignore[arg-type]
+
+
+def test_evenly_takes_first_and_last():
+    assert evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
+    assert evenly([1, 2], 5) == [1, 2]
+    assert evenly([], 3) == []
 
 
 def test_lists_of_what_is_right_are_taken():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.faces import CUBE
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
-from og_pointcloud.scene import Camera, Scene, View
+from og_pointcloud.scene import Camera, Scene, View, evenly
 
 SAMPLE_VIEWS = 12
 SAMPLE_POINTS = 20_000
@@ -126,8 +126,7 @@ def draw_sample(scene: Scene) -> Sample:
     beside = {image + face for image in images for face in CUBE if face != "front"}
     ahead = [row for row, name in enumerate(names) if name not in beside]
     order = sorted(ahead if len(ahead) >= SAMPLE_VIEWS else range(len(names)), key=names.__getitem__)
-    spread = np.unique(np.linspace(0, len(order) - 1, min(SAMPLE_VIEWS, len(order))).round().astype(int))
-    places = tuple(order[row] for row in spread)
+    places = tuple(evenly(order, SAMPLE_VIEWS))
     cameras = tuple(view.camera for view in scene.views)
     views, points = tuple(scene.views[place] for place in places), scene.points
     step = 1 + (len(points) - 1) // SAMPLE_POINTS

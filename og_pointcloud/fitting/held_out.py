@@ -24,7 +24,7 @@ from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import Neighborhood, isotropic, neighborhood, sample_of_points
-from og_pointcloud.scene import Points, View
+from og_pointcloud.scene import Points, View, evenly
 from og_pointcloud.settings import FitSettings
 
 MASK_MAPS_MEMORY_SHARE = 0.05
@@ -67,8 +67,7 @@ def choose_scale(
         return ScaleChoice(geometry.scales[0], {})
     # By name, so that a capture's views give the same halves in any order; frames of a video then alternate.
     masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)
-    spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
-    chosen = [masked[index] for index in np.unique(spread)]
+    chosen = evenly(masked, geometry.held_out_views)
     if len(chosen) < MIN_VIEWS:
         return ScaleChoice(geometry.middle_scale, {})
     size = sum(4 * view.camera.width * view.camera.height for view in chosen)

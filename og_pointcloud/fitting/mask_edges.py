@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from og_pointcloud.fitting.seen_colors import with_photograph
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import Scene, View
+from og_pointcloud.scene import Scene, View, evenly
 
 MIN_CONTRAST_RATIO = 1.5
 """Masks end early only where the contrast farther out is more than this many times that at their edges."""
@@ -61,8 +61,8 @@ def pixels_short(views: Sequence[View]) -> int:
     """By how many pixels masks end before what they show, 0 if they do not, or too few views tell. In images longer
     than COMPARED_SIZE, by how many of the pixels compared."""
     usable = sorted((view for view in views if view.mask_count and view.image is not None), key=lambda view: view.name)
-    spread = np.unique(np.linspace(0, len(usable) - 1, min(COMPARED_VIEWS, len(usable))).round().astype(int))
-    found = [contrast for index in spread if (contrast := edge_contrast(usable[index])) is not None]
+    compared = evenly(usable, COMPARED_VIEWS)
+    found = [contrast for view in compared if (contrast := edge_contrast(view)) is not None]
     if len(found) < MIN_COMPARED_VIEWS:
         return 0
     of_views = np.array(found)

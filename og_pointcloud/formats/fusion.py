@@ -26,7 +26,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFrame, DepthImage
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.scene import Camera, DoubleArray, Points
+from og_pointcloud.scene import Camera, DoubleArray, Points, evenly
 
 SURVEYED_VIEWS = 16
 """Views, spread evenly, that are compared with each other before the fusion."""
@@ -149,12 +149,6 @@ def survey(frames: Sequence[DepthFrame]) -> Survey:
     # both, sqrt(2) times that of one; it is relative, so it is scaled by the typical depth.
     noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
     return Survey(typical, float(np.median(np.concatenate(widths))), float(noise))
-
-
-def evenly(items: Sequence[Any], count: int) -> list[Any]:
-    """At most ``count`` items, spread evenly over the sequence."""
-    rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)) if items else ()
-    return [items[row] for row in rows]
 
 
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
