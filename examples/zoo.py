@@ -50,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.constants:
         _write_constants(options)
         return
+    options.captures = [path.absolute() for path in options.captures]  # "." has no name
     paths = [*options.captures, *map(Path, scene_names())]
     chosen = [path for path in paths if is_chosen(path.name, options.half, options.only)]
     if not chosen:

@@ -414,9 +414,10 @@ def test_a_worse_scene_is_scored_at_the_points_it_had(scenes):
 
 
 @pytest.mark.parametrize("change", ["views=0", "points=1.5", "masks=no", "colors=blue", "light=1"])
-def test_what_makes_nothing_worse_is_told(scenes, tmp_path, change, capsys):
+def test_what_makes_nothing_worse_is_told(scenes, tmp_path, change, monkeypatch):
+    monkeypatch.chdir(scenes[0])
     with pytest.raises(SystemExit, match=f"'{change}' makes nothing worse; expected one of views, points"):
-        zoo.main(["-o", str(tmp_path), "--captures", str(scenes[0]), "--only", "tiny", "--worse", change])
+        zoo.main(["-o", str(tmp_path), "--captures", ".", "--only", "tiny", "--worse", change])
 
 
 def test_what_a_capture_needs_is_asked_alone(tmp_path, capsys):
