@@ -161,13 +161,10 @@ class Mapper:
     def _began_with(self) -> str:
         """What decides how changes are replayed, in words."""
         xyz = np.zeros((0, 3), np.float32) if self._map is None else self._map.points.xyz
-        checksums = (
-            zlib.crc32(np.ascontiguousarray(xyz).tobytes()),
-            zlib.crc32(repr(replace(self.settings, memory=None)).encode()),
-        )
+        points, settings = xyz.tobytes(), repr(replace(self.settings, memory=None)).encode()
         return (
-            f"{len(xyz)} points (checksum {checksums[0]}), spacing {self._spacing}, {self._space}, and settings of "
-            f"checksum {checksums[1]}"
+            f"{len(xyz)} points (checksum {zlib.crc32(points)}), spacing {self._spacing}, {self._space}, and settings "
+            f"of checksum {zlib.crc32(settings)}"
         )
 
     def _resumed(self, journal: MapJournal) -> MapJournal:

@@ -85,18 +85,15 @@ def to_objects(
 
 
 def _detection(number: int, box: Box, name: str, score: float, head: Any, messages: MessageFactory) -> Any:
-    pose, size = _pose(box, messages), messages("geometry_msgs/msg/Vector3", **_named(box.size, "xyz"))
+    position = messages("geometry_msgs/msg/Point", **_named(box.center, "xyz"))
+    orientation = messages("geometry_msgs/msg/Quaternion", **_named(box.rotation_wxyz, "wxyz"))
+    pose = messages("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+    size = messages("geometry_msgs/msg/Vector3", **_named(box.size, "xyz"))
     hypothesis = messages("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
     uncertain = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
     result = messages("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=uncertain)
     bbox = messages("vision_msgs/msg/BoundingBox3D", center=pose, size=size)
     return messages("vision_msgs/msg/Detection3D", header=head, results=[result], bbox=bbox, id=str(number))
-
-
-def _pose(box: Box, messages: MessageFactory) -> Any:
-    position = messages("geometry_msgs/msg/Point", **_named(box.center, "xyz"))
-    orientation = messages("geometry_msgs/msg/Quaternion", **_named(box.rotation_wxyz, "wxyz"))
-    return messages("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
 
 def _named(values: NDArray[np.floating], names: str) -> dict[str, float]:

@@ -18,8 +18,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.qos import QoSReliabilityPolicy  # pyright: ignore[reportMissingImports]
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # pyright: ignore[reportMissingImports]
 from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
@@ -85,7 +83,7 @@ class MapNode(PlacedNode):
                 self._warn(f"a frame was dropped: {error_text(error)}")
             self._assembler.forget(stamp)
 
-    def _pose_at(self, frame_id: str, stamp: int) -> NDArray[np.float64]:
+    def _pose_at(self, frame_id: str, stamp: int) -> Any:
         return self._pose(frame_id, time_message(ros_messages, stamp))
 
     def _on_change(self, change: FrameChange) -> None:
