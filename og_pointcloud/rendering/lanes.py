@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,20 +39,9 @@ class Truths(types.Type):
 
 
 LANES, TRUTHS = Lanes("Lanes"), Truths("Truths")
-
-
-def _register(kind: type[types.Type], vector: ir.VectorType) -> None:
-    """Tell numba that values of this type are LLVM vectors, held in registers."""
-
-    class Model(models.PrimitiveModel):
-        def __init__(self, manager: Any, of: Any) -> None:
-            super().__init__(manager, of, vector)
-
-    register_model(kind)(Model)
-
-
-_register(Lanes, FLOATS)
-_register(Truths, BOOLS)
+# Their values are LLVM vectors, held in registers.
+register_model(Lanes)(partial(models.PrimitiveModel, be_type=FLOATS))
+register_model(Truths)(partial(models.PrimitiveModel, be_type=BOOLS))
 
 
 def _operator(
