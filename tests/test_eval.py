@@ -13,7 +13,6 @@ from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 from scenes import NAMES, write_tiny_capture
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
 from og_pointcloud.evaluate.scannet import TASKS, read_truth, score_scene
@@ -69,13 +68,13 @@ def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
     assert "points, the truth 3; expected the truth's points" in error_of(capsys, *bare)
 
 
-def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path):
+def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path, capsys):
     """No point is answered: precision has no value, which JSON has no word for."""
     cloud = og.load(fitted / "S.ogpc").cloud
     silent = replace(cloud, instance_ids=np.full(len(cloud), BACKGROUND, np.int32))
     og.write_bundle(silent, tmp_path / "silent.ogpc")
-    command = ["eval", "capture", str(fitted / "tiny"), str(tmp_path / "silent.ogpc")]
-    assert main([*command, "--json", str(tmp_path / "s.json")]) == 0
+    command = ("eval", "capture", fitted / "tiny", tmp_path / "silent.ogpc")
+    output_of(capsys, *command, "--json", tmp_path / "s.json")
     entry = json.loads((tmp_path / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))["tiny"]
     assert entry["labels"]["miou"] == 0
     assert entry["answered"]["miou"] is None

@@ -22,11 +22,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from commands import error_of, output_of
+from commands import error_of, output_of, run
 from scenes import write_tiny_capture
 
 import og_pointcloud as og
-from og_pointcloud.cli import main
 from og_pointcloud.collection import fit_many as module
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.fitting.tasks import LocalWorkers, Share, dask_executor, run_tasks, share_here
@@ -299,12 +298,11 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     out, report = tmp_path / "out", tmp_path / "report.json"
     broken = tmp_path / "broken"
     broken.mkdir()
-    assert main(["fit", str(captures[0]), str(broken), "--out", str(out), "--json", str(report)]) == 2
-    said = capsys.readouterr()
-    assert "1 fitted, 0 already there, 1 failed" in said.out
-    assert f"failed: {broken}" in said.err
-    assert said.err.count(str(broken)) == 1
-    assert "1 of 2 captures failed" in said.err
+    code, stdout, stderr = run(capsys, "fit", captures[0], broken, "--out", out, "--json", report)
+    assert (code, "1 fitted, 0 already there, 1 failed" in stdout) == (2, True)
+    assert f"failed: {broken}" in stderr
+    assert stderr.count(str(broken)) == 1
+    assert "1 of 2 captures failed" in stderr
     assert [fit["state"] for fit in json.loads(report.read_text())["fits"]] == ["fitted", "failed"]
     assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}
     assert "0 fitted, 1 already there" in output_of(capsys, "fit", captures[0], "--out", out)

@@ -11,12 +11,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from commands import error_of
+from commands import error_of, output_of
 from scenes import COLORS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate import sweep as sweeping
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
@@ -264,8 +263,7 @@ def test_seconds_of_the_chart_are_plain_numbers(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     out = tmp_path / "r"
-    assert main(["report", str(folder), "--knob", "views", "--knob", "sure share", "-o", str(out)]) == 0
-    printed = capsys.readouterr().out
+    printed = output_of(capsys, "report", folder, "--knob", "views", "--knob", "sure share", "-o", out)
     assert f"wrote {out / 'report.md'}" in printed
     assert "views: one of 2" in printed
     rows = {(r["knob"], r["value"]): r for r in csv.DictReader((out / "report.csv").open())}
