@@ -9,7 +9,7 @@ import numpy as np
 from labelled_clouds import unit_rows
 from numpy.typing import ArrayLike, NDArray
 from pinhole import looking
-from reference_splatting import pixel_weights, reference_pixel_weights
+from reference_splatting import pixel_weights, reference_pixel_weights, round_splats
 from scenes import ray_cast, write_scene
 from scipy.sparse import csr_array
 
@@ -64,8 +64,7 @@ def scatter(count: int = 10, seed: int = 0) -> Gaussians:
 
 def solid(xyz: NDArray[np.float32]) -> Gaussians:
     """Round, nearly opaque Gaussians at these points."""
-    rotation = np.tile(single([1, 0, 0, 0]), (len(xyz), 1))
-    return Gaussians(xyz, np.full((len(xyz), 3), 0.06, np.float32), rotation, np.full(len(xyz), 0.9, np.float32))
+    return round_splats(xyz, 0.06)
 
 
 def dense_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
