@@ -1,5 +1,6 @@
 """A capture folder becomes the same Scene whatever its format, and each thing that can be wrong has one clear error."""
 
+import pickle
 import shutil
 import struct
 import sys
@@ -223,6 +224,19 @@ def test_distorted_captures_are_undistorted(capture):
     assert r > (border - cx) / fx
     image = view.image_rgb()
     assert abs(float(image[row, first, 0]) - 250 * border / WIDTH) < 6
+
+
+@pytest.mark.parametrize("keys", [{}, {"k1": -0.3}, {"is_fisheye": True, "fl_x": 20, "fl_y": 20}])
+def test_views_go_to_other_processes_whatever_their_lens(capture, keys):
+    """As `fit` sends them to the workers of an executor."""
+    folder, world = capture
+    write_transforms(folder, world, ply_file_path="points.ply", **keys)
+    views = read_capture(folder).views
+    assert ("/" in views[0].name) == ("is_fisheye" in keys)
+    for view in views:
+        sent = pickle.loads(pickle.dumps(view))
+        np.testing.assert_array_equal(sent.mask_map(), view.mask_map())
+        np.testing.assert_array_equal(sent.image_rgb(), view.image_rgb())
 
 
 # Names and files of images.

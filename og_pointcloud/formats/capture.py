@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import posixpath
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import compress
@@ -59,7 +59,7 @@ from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame,
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Camera, CutMasks, Points, Scene, View
+from og_pointcloud.scene import Camera, CutMasks, IntArray, Points, Scene, View
 
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
@@ -259,26 +259,27 @@ def _layers(
     read, feature_space = _read_masks(capture, distinct, level)
     stored = dict(zip(distinct, repaired_layers(read, repairs), strict=True))
     # Faces of one image share its decoded mask map.
-    latest = lru_cache(maxsize=DECODED_MAPS)(lambda name: stored[name].read())
+    decoded = lru_cache(maxsize=DECODED_MAPS)(lambda name: stored[name].read())
     # Masks of a whole image are cut to the view; a cube face's own masks have its pixels already.
     return [
-        _layer_of(face, replace(stored[name], read=partial(latest, name)), view)
+        _layer_of(face, stored[name], view, partial(decoded, name))
         if face and (not face.name or name != view)
         else stored[name]
         for view, name, face in zip(poses.names, called, faces, strict=True)
     ], feature_space
 
 
-def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
-    """A view's part of a whole image's masks; a cube's face keeps only the masks that it shows."""
+def _layer_of(face: Face, layer: MaskLayer, view: str, decoded: Callable[[], IntArray]) -> MaskLayer:
+    """A view's part of a whole image's masks; a cube's face keeps only the masks that it shows. decoded: the image's
+    map, in this process; what the view reads later may be asked for in another one."""
     _require_shape(view, layer, face.whole)
     scaled = face.of_whole_size(*layer.size)
     size = scaled.camera.width, scaled.camera.height
     if not face.name:  # the one view of an image shows all of its masks
-        return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
+        return MaskLayer(size, layer.features, partial(_read_part, scaled, layer.read), layer.tracks)
     # The features of a face depend on the masks that it shows: the map is read now, and kept as runs of equal ids.
     # These are smaller than the features of most masks, and the whole image is not read again for each of its faces.
-    ids = scaled.mask_ids(layer.read())
+    ids = scaled.mask_ids(decoded())
     flat, shape = ids.ravel(), ids.shape
     first = np.flatnonzero(np.append(True, flat[1:] != flat[:-1]))
     values, lengths = flat[first], np.diff(first, append=flat.size)
@@ -291,7 +292,15 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     rows = row_of_id[values]
     tracks = None if layer.tracks is None else layer.tracks[used]
     cut = CutMasks(posixpath.dirname(view), used)
-    return MaskLayer(size, layer.features[used], lambda: np.repeat(rows, lengths).reshape(shape), tracks, cut)
+    return MaskLayer(size, layer.features[used], partial(_from_runs, rows, lengths, shape), tracks, cut)
+
+
+def _read_part(face: Face, read: Callable[[], IntArray]) -> IntArray:
+    return face.mask_ids(read())
+
+
+def _from_runs(rows: IntArray, lengths: NDArray[np.intp], shape: tuple[int, ...]) -> IntArray:
+    return np.repeat(rows, lengths).reshape(shape)
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str | None) -> tuple[list[MaskLayer], str]:
