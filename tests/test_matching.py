@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import pixel_weights
+from reference_splatting import pixel_weights, round_splats
 from test_grouping import ONE, OTHER, HandView, hand_table
-from test_visibility import IDENTITY, NEAR, camera, cloud, patches
+from test_visibility import NEAR, camera, cloud, patches
 
 from og_pointcloud.fitting.learned.matching import (
     Evidence,
@@ -95,9 +95,9 @@ def wall(x: tuple[float, float], depth: float) -> Gaussians:
     """An opaque upright sheet of splats a pixel apart, seen by `camera`."""
     step = depth / 40
     across, down = np.meshgrid(np.arange(x[0], x[1], step), np.arange(-0.2, 0.2, step))
-    xyz = np.stack([across.ravel(), down.ravel(), np.full(across.size, depth)], axis=1).astype(np.float32)
+    xyz = np.stack([across.ravel(), down.ravel(), np.full(across.size, depth)], axis=1)
     flat = np.tile(np.array([step, step, 1e-4], np.float32), (len(xyz), 1))
-    return Gaussians(xyz, flat, np.tile(IDENTITY, (len(xyz), 1)), np.full(len(xyz), 0.99, np.float32))
+    return replace(round_splats(xyz, step, 0.99), scale=flat)
 
 
 def both(a: Gaussians, b: Gaussians) -> Gaussians:
