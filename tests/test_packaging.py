@@ -1,5 +1,6 @@
-"""What an installation brings: the names that are imported."""
+"""What an installation brings: the names that are imported; what it needs."""
 
+import re
 import zipfile
 from pathlib import Path
 
@@ -34,3 +35,10 @@ def test_wheel_has_every_module(wheel_names):
     assert "og_pointcloud/scene.py" in on_disk
     assert on_disk <= set(wheel_names)
     assert {"og_pointcloud/py.typed", "og_pointcloud/text/everyday_words.txt"} <= set(wheel_names)
+
+
+def test_the_oldest_packages_that_are_tested_are_those_that_are_promised():
+    promised = dict(re.findall(r'"(\w+)>=([\d.]+)"', (ROOT / "pyproject.toml").read_text()))
+    tested = dict(re.findall(r'"(\w+)==([\d.]+)\.\*"', (ROOT / "scripts" / "other_pythons.sh").read_text()))
+    assert {"numpy", "onnxruntime"} <= tested.keys()
+    assert tested.items() <= promised.items()
