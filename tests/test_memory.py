@@ -442,6 +442,7 @@ def test_what_follows_from_a_table_on_disk_is_on_disk() -> None:
     votes = view_votes(table)
     matrices = (table.weights, table.outside, table.exposure, votes.in_mask, votes.vote)
     assert all(in_file(matrix.data) and in_file(matrix.indices) for matrix in matrices)
+    assert all(in_file(by_point) for _, by_point in votes.by_point)
 
 
 def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.MonkeyPatch) -> None:
