@@ -280,6 +280,11 @@ def test_the_ring_of_votes_follows_its_numbers():
     np.testing.assert_array_equal(sightings.VOTE_SAMPLES, before)
     with numbers._in_module("rendering.sightings.EDGE_PX", sightings.EDGE_PX):  # as it stands: the same ring
         np.testing.assert_allclose(sightings.VOTE_SAMPLES, before)
+    ids = np.where(np.arange(24) < 10, -1, 0) * np.ones((8, 1), np.int32)  # a mask, two pixels beyond the first block
+    assert sightings._within_masks(ids)[0, 0]
+    with numbers._in_module("rendering.sightings.EDGE_PX", 3.0):
+        assert not sightings._within_masks(ids)[0, 0]
+    assert sightings._within_masks(ids)[0, 0]
 
 
 def test_verdicts_of_numbers(tmp_path):

@@ -62,7 +62,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.association.SAME_KIND_BOUND": ("", ()),
     "fitting.association.DOMINANT_WEIGHT_RATIO": ("", ()),
     "rendering.sightings.MIN_OPENNESS": ("table", ("_trace_openness",)),
-    "rendering.sightings.EDGE_PX": ("table", ()),
+    "rendering.sightings.EDGE_PX": ("table", ("_within_masks", "_votes")),
     "rendering.smoothing.NOISE_NEIGHBORS": ("table", ("_smoothed",)),
     "rendering.smoothing.NOISE_BIAS": ("table", ("_smoothed",)),
     "rendering.sightings.RING_SHARE": ("table", ()),
@@ -265,10 +265,11 @@ def _put(module: Any, name: str, value: Any, path: str) -> None:
     # numba freezes a module's numbers into compiled code, which it would load from the disk cache.
     changes = getattr(module, name) != value
     setattr(module, name, value)
-    if path.startswith("rendering.sightings."):  # where votes are sampled depends on two of its numbers
+    if path.startswith("rendering.sightings."):  # where votes are sampled, and how far away, depends on two numbers
         share, edge = module.RING_SHARE, module.EDGE_PX
         ring = [(edge * np.cos(angle), edge * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
         module.VOTE_SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
+        module.REACH_PX = int(np.ceil(edge))
     for function in MODULES[path][1] if changes else ():
         compiled = getattr(module, function)
         compiled._cache = NullCache()
