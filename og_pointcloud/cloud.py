@@ -41,7 +41,7 @@ class FeatureSpace:
     """
 
     name: str
-    width: int
+    width: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):

@@ -88,7 +88,7 @@ def bank_of_encoder(space: FeatureSpace, folder: StrPath | None = None) -> WordB
     """The word bank of a text encoder's folder, or of the encoder found for the space; None if it has none or is of
     another space."""
     encoder = find_encoder(space.name) if folder is None else read_text_encoder(folder)
-    if encoder is None or not FeatureSpace(space.name, 0).accepts(FeatureSpace(encoder.feature_space, 0)):
+    if encoder is None or not FeatureSpace(space.name).accepts(FeatureSpace(encoder.feature_space)):
         return None
     return encoder.word_bank
 

@@ -60,7 +60,7 @@ def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
     folder = arguments.text_encoder
     encoder = read_text_encoder(folder) if folder else encoder_for(own, carried_encoder(arguments.bundle))
     encoded = FeatureSpace(encoder.feature_space, encoder.width)
-    FeatureSpace(own, 0).require(encoded, f"texts that {encoder.where} encodes")
+    FeatureSpace(own).require(encoded, f"texts that {encoder.where} encodes")
     return encoder
 
 

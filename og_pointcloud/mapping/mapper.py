@@ -104,7 +104,7 @@ class Mapper:
         if spacing is not None and not (start is None and cloud is None):
             raise SceneError(f"spacing is {spacing:g}, but a map or a cloud is given, which has its own: leave it out")
         self.settings = fit_settings(settings)
-        self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
+        self._space, self._spacing = FeatureSpace(feature_space), spacing
         self._base = None if start is None else as_scene(start).cloud
         self._map: GrowingMap | None = None
         self._neighborhood: Neighborhood | None = None  # of a known cloud

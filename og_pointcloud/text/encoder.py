@@ -165,7 +165,7 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     or contain encoders. None if there is none; OgPointcloudError if there is one that cannot be used.
     """
     if carried is not None and (encoder := carried()):
-        if not FeatureSpace(feature_space, 0).accepts(FeatureSpace(encoder.feature_space, 0)):
+        if not FeatureSpace(feature_space).accepts(FeatureSpace(encoder.feature_space)):
             raise FeatureSpaceError(
                 f"{encoder.where} has feature space '{encoder.feature_space}', the scene has '{feature_space}', and "
                 "vectors of two spaces cannot be compared: store the scene's own (og-pointcloud export --help)"

@@ -87,7 +87,7 @@ def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | N
         return None
     vocabulary, space = words_of(text_features)
     source = "text_features" if isinstance(text_features, tuple) else str(Path(text_features))
-    FeatureSpace(feature_space, 0).require(FeatureSpace(space, vocabulary.vectors.shape[1]), f"names of {source}")
+    FeatureSpace(feature_space).require(FeatureSpace(space, vocabulary.vectors.shape[1]), f"names of {source}")
     return vocabulary
 
 
