@@ -26,8 +26,8 @@ from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
 
 POINTS_MODE, ARRAY_BUFFER = 0, 34962
-COMPONENT_TYPES = {"f": 5126, "H": 5123}
-"""FLOAT and UNSIGNED_SHORT. Ids are floats, exact up to 2^24: glTF has no 32-bit integers for vertices."""
+FLOAT = 5126
+"""Component type of all columns. Ids too, exact up to 2^24: glTF has no 32-bit integers for vertices."""
 VECTOR_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
 FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
@@ -113,15 +113,13 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
     return {f"{SPLATS}:{name}": column for name, column in columns.items()}
 
 
-def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.uint16]:
-    """(n, 4) uint16 linear color, and opacity, 1 without splats. 16 bits: 8 bits of linear color would lose dark
-    colors."""
+def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.float32]:
+    """(n, 3) float32 linear color; (n, 4) with the opacity of splats. 8 bits would lose dark colors, and of 16 bits
+    trimesh reads the lower ones."""
     # The transfer function of sRGB, IEC 61966-2-1.
     share = np.arange(256) / 255
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    table = np.rint(linear * 65535).astype(np.uint16)
-    opacity = np.ones(len(rgb)) if splats is None or splats.opacity is None else splats.opacity
-    return np.column_stack([table[rgb], np.rint(65535 * opacity).astype(np.uint16)])
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float32)[rgb]
+    return linear if splats is None else np.column_stack([linear, splats.gaussians[2]])
 
 
 def _document(
@@ -187,15 +185,12 @@ def _feature_sets(
 
 def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
     """The document's entry for a column, whose data is appended to the buffer."""
-    little_endian = column.astype(column.dtype.newbyteorder("<"), copy=False)
     accessor: dict[str, Any] = {
-        "bufferView": buffer.add(little_endian.tobytes(), target=ARRAY_BUFFER),
-        "componentType": COMPONENT_TYPES[column.dtype.char],
+        "bufferView": buffer.add(column.astype("<f4", copy=False).tobytes(), target=ARRAY_BUFFER),
+        "componentType": FLOAT,
         "count": len(column),
         "type": VECTOR_TYPES[column.shape[1] if column.ndim == 2 else 1],
     }
-    if column.dtype == np.uint16:
-        accessor["normalized"] = True
     if with_bounds:  # required for positions by the specification
         accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
     return accessor
