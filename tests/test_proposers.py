@@ -237,13 +237,39 @@ def test_a_folder_by_image_name(tmp_path):
     polygon = folder.of("c", (60, 80))
     assert polygon.scores.tolist() == [0.25]
     assert polygon.masks[0][5:20, 5:25].all()
-    assert polygon.masks[0].mean() == pytest.approx(31 * 41 / 120 / 160, rel=0.1)
+    assert polygon.masks[0].sum() == 15 * 20
     assert len(folder.of("d", (4, 5))) == 0
     assert len(folder.of("rgb/c", (60, 80))) == 1
     assert len(folder.of("left/rgb/c", (60, 80))) == 1
     for another in ("e", "left/c", "left/d"):  # the path in the file names another camera, or none
         with pytest.raises(SceneError, match=f"no masks for image '{another}'"):
             folder.of(another, (4, 5))
+
+
+def test_polygons_cover_the_pixels_whose_centers_they_contain(tmp_path):
+    rings = {
+        "edges between pixels": [2, 3, 7, 3, 7, 5, 2, 5],
+        "beyond the image": [-5, -5, 3.4, -5, 3.4, 40, -5, 40],
+        "slanted": [1.2, 0.3, 9.9, 4.1, 5.3, 9.7, 0.1, 6.2],
+        "thinner than a pixel": [0, 4.6, 10, 4.6, 10, 5.4, 0, 5.4],
+        "a star, hollow inside": [5, 0, 8, 9.5, 0.3, 3.6, 9.7, 3.6, 2, 9.5],
+    }
+    coco = {
+        "images": [{"id": 1, "file_name": "a.png", "height": 10, "width": 11}],
+        "annotations": [{"image_id": 1, "segmentation": [ring]} for ring in rings.values()],
+    }
+    (tmp_path / "all.json").write_text(json.dumps(coco))
+    masks = ExistingMasks(tmp_path).of("a", (10, 11)).masks
+    for mask, (kind, ring) in zip(masks, rings.items(), strict=True):
+        corners = np.reshape(ring, (-1, 2))
+        for row, column in np.ndindex(10, 11):
+            ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+            crossed = [
+                x + (row + 0.5 - y) * (next_x - x) / (next_y - y) <= column + 0.5
+                for (x, y), (next_x, next_y) in ends
+                if (y <= row + 0.5) != (next_y <= row + 0.5)
+            ]
+            assert mask[row, column] == sum(crossed) % 2, (kind, row, column)
 
 
 def test_a_function_may_return_tensors():

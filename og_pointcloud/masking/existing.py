@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, first_line
-from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, without_suffix
+from og_pointcloud.formats.images import MAX_PIXELS, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
-from og_pointcloud.scene import numbers_of
+from og_pointcloud.scene import DoubleArray, numbers_of
 
 _READING_COCO = Lock()
 """A file is read once, not once in each thread: from Python 3.12 on, cached_property does not see to it."""
@@ -278,7 +278,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Pro
 
 def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
     """The mask inside rings of x, y in pixels. size: [height, width]."""
-    drawn = np.zeros(_size(size, source), np.uint8)
+    drawn = np.zeros(_size(size, source), np.bool_)
     for ring in polygons:
         try:
             corners = np.array(ring, np.float64).reshape(-1, 2)
@@ -286,8 +286,22 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
             corners = np.empty((0, 2))
         if len(corners) < 3 or not (np.abs(corners) < 1e6).all():
             raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y, ... of at least three corners")
-        require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
-    return drawn.astype(np.bool_)
+        drawn |= _inside(corners, drawn.shape)
+    return drawn
+
+
+def _inside(corners: DoubleArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H, W) the pixels whose center is inside a ring of (n, 2) x, y. OpenCV's fillPoly also fills those that it only
+    touches: half a pixel more all around."""
+    height, width = shape
+    flips = np.zeros((height, width + 1), np.bool_)
+    for (x, y), (next_x, next_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        # Along a row, each edge that it crosses leads in or out.
+        first, end = np.clip(np.ceil(np.sort([y, next_y]) - 0.5), 0, height).astype(np.int64)
+        rows = np.arange(first, end)
+        crossings = x + (rows + 0.5 - y) / (next_y - y or 1) * (next_x - x)
+        flips[rows, np.clip(np.ceil(crossings - 0.5), 0, width).astype(np.int64)] ^= True
+    return np.logical_xor.accumulate(flips[:, :width], axis=1)
 
 
 def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
