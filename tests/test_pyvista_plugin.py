@@ -20,7 +20,7 @@ pv = pytest.importorskip("pyvista")
 
 from og_pointcloud_pyvista import can_render, to_pyvista  # noqa: E402
 from og_pointcloud_pyvista.datasets import box_lines  # noqa: E402
-from og_pointcloud_pyvista.plotting import HIGHLIGHT, UNKNOWN_COLOR  # noqa: E402
+from og_pointcloud_pyvista.plotting import HIGHLIGHT, UNKNOWN_COLOR, font_file  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -158,6 +158,14 @@ def test_select_extracts_the_fitting_instances_with_their_scores(scene):
     assert "og_instance" not in mesh.point_data
 
 
+@pytest.mark.parametrize("kind", ["cloud", "points alone", "image", "structured", "unstructured"])
+def test_select_finds_points_that_make_up_no_cell(scene, kind):
+    mesh = grids(scene)[kind]
+    expected = np.isin(scene.instances_at(np.asarray(mesh.points)), og.select(scene, "plum").instances)
+    assert expected.any()
+    assert np.allclose(mesh.og.select("plum", scene).points, mesh.points[expected])
+
+
 def test_selecting_nothing_says_what_is_closest(scene):
     mesh = pv.PolyData(scene.xyz)
     vectors = {"nothing": -scene.cloud.instances.descriptors.sum(axis=0)}
@@ -253,6 +261,30 @@ def test_a_segmentation_is_drawn_in_its_colors_with_a_legend(plotter, scene):
     ordered = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
     assert entries == [*(f"{name}  {counts[name]:,}" for name in ordered), f"unknown  {(mesh['og_label'] < 0).sum():,}"]
     assert len([name for name in plotter.actors if name.startswith("og_segmentation")]) == 2, "drawn again, not twice"
+
+
+@pytest.mark.parametrize("shown", ["legend", "names", "answer"])
+def test_words_in_other_scripts_are_drawn(drawing, scene, shown):
+    pictures = []
+    for word in ("кот", "дом"):  # where VTK's own font is taken, both are blank
+        words = {word: scene.cloud.instances.descriptors[0]}
+        mesh = pv.PolyData(scene.xyz).og.segment(words, scene)
+        plotter = pv.Plotter(off_screen=True, window_size=[400, 300])
+        plotter.og.add_segmentation(mesh, names=shown == "names", legend=shown == "legend")
+        if shown == "answer":
+            plotter.og.enable_click_query(scene, words, show_message=False)
+            assert plotter.og.query(scene.xyz[scene.instance_ids == 0][0]).found
+        pictures.append(plotter.screenshot(return_img=True))
+        plotter.close()
+    assert (pictures[0] != pictures[1]).any()
+
+
+def test_words_that_no_font_has_are_said(monkeypatch):
+    font_manager = pytest.importorskip("matplotlib.font_manager")
+    monkeypatch.setattr(font_manager.fontManager, "ttflist", [])
+    with pytest.warns(UserWarning, match="no font of this machine has all of 子椅"):
+        assert Path(font_file("a 椅子")).is_file()
+    assert font_file("Tür, żółty") is None
 
 
 def test_the_datasets_own_colors_shade_those_of_the_labels(plotter, scene):

@@ -74,7 +74,8 @@ class OgDataSet:
         against: Labels = None,
         text_features: TextFeatures = None,
     ) -> pv.UnstructuredGrid:
-        """The points of the instances that match a text, and the cells that consist of these points alone.
+        """The cells that consist of points of the instances that match a text, with these points; where there is no
+        such cell, the points alone.
 
         Point arrays: og_instance, and og_score of the instance.
         text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected.
@@ -82,11 +83,13 @@ class OgDataSet:
         found = find_scene(self._mesh, scene)
         selection = og.select(found, text, against=against, text_features=text_features)
         mesh = self._with_instances(found, scene)
-        if not (mesh.n_points and np.isin(mesh.point_data[INSTANCE], selection.instances).any()):
+        chosen = np.isin(mesh.point_data[INSTANCE], selection.instances) if mesh.n_points else np.zeros(0, bool)
+        if not chosen.any():
             warnings.warn(f"no point of this dataset is selected: {selection}", stacklevel=2)
             return pv.UnstructuredGrid()
-        chosen = list(selection.instances)
-        points = mesh.extract_values(chosen, scalars=INSTANCE, preference="point", adjacent_cells=False)
+        points = mesh.extract_points(chosen, adjacent_cells=False)
+        if not points.n_points:
+            points = mesh.extract_points(chosen, include_cells=False)
         ids = np.asarray(points.point_data[INSTANCE])
         score = {match.instance: match.score for match in selection.fitting}
         points.point_data[SCORE] = np.array([score[instance] for instance in ids.tolist()], np.float32)

@@ -7,11 +7,13 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
+from vtkmodules.vtkCommonCore import VTK_FONT_FILE
 
 import og_pointcloud as og
 from og_pointcloud.ask.boxes import unit_up
@@ -35,6 +37,10 @@ MAX_DARKENING = 0.5
 visible."""
 PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
 TEXT_SIZE = 11
+LATIN_END = 0x180
+"""VTK's own font has the characters before this one; it draws nothing in place of those that it lacks."""
+PLACEHOLDER_FONT = "Last Resort"
+"""Draws the same box for all characters of a script."""
 
 
 def can_render() -> bool:
@@ -170,7 +176,10 @@ class OgPlotter:
             self._highlight(hit)
         else:
             self._plotter.remove_actor(["og_highlight", "og_highlight_box"])
-        self._plotter.add_text(self._answer(hit), position="lower_left", font_size=TEXT_SIZE, name="og_answer")
+        answer = self._answer(hit)
+        self._plotter.add_text(
+            answer, position="lower_left", font_size=TEXT_SIZE, name="og_answer", font_file=font_file(answer)
+        )
         if self._on_click is not None:
             self._on_click(hit)
         return hit
@@ -217,6 +226,9 @@ class OgPlotter:
         # Placed in the upper right corner manually: PyVista's `loc` puts wide legends too far inside.
         legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)
         legend.SetPosition2(*size)
+        if file := font_file("".join(words)):
+            legend.GetEntryTextProperty().SetFontFile(file)
+            legend.GetEntryTextProperty().SetFontFamily(VTK_FONT_FILE)
         # Words in the text's color beside a swatch: by default VTK gives both the color of the swatch.
         for index, (_, color) in enumerate(entries if colored else []):
             legend.SetEntryIcon(index, _swatch(color))
@@ -237,8 +249,37 @@ class OgPlotter:
                 [words[int(labels[labelled][order][first[part]])] for part in largest],
                 font_size=13, bold=False, font_family="arial", text_color="black", shape_color="white",
                 shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=f"{name}_names",
-                reset_camera=False,
+                reset_camera=False, font_file=font_file("".join(words)),
             )  # fmt: skip
+
+
+@lru_cache
+def font_file(text: str) -> str | None:
+    """Path of a font of this machine that has all characters of a text; None if VTK's own has them. Warns if none has
+    them: the font that comes with matplotlib, which PyVista requires, is taken then."""
+    needed = {ord(character) for character in text if character.isprintable()}
+    if max(needed, default=0) < LATIN_END:
+        return None
+    from matplotlib.font_manager import findfont, fontManager
+
+    shipped = findfont("DejaVu Sans")
+    others = (entry.fname for entry in fontManager.ttflist if not entry.name.startswith(PLACEHOLDER_FONT))
+    for path in (shipped, *others):
+        if needed <= _characters(path):
+            return path
+    lacking = "".join(map(chr, sorted(needed - _characters(shipped))))
+    warnings.warn(f"no font of this machine has all of {lacking:.40}: they are left out; install one", stacklevel=4)
+    return shipped
+
+
+def _characters(path: str) -> set[int]:
+    """Codes of the characters that a font file has; none if it cannot be read."""
+    from matplotlib.font_manager import get_font
+
+    try:
+        return set(get_font(path).get_charmap())
+    except (OSError, RuntimeError):
+        return set()
 
 
 def _colors(ids: NDArray[np.integer]) -> NDArray[np.uint8]:
