@@ -118,6 +118,18 @@ def test_a_browser_that_has_left_before_it_is_welcomed_gets_no_screen(page):
     assert page._screens == {}
 
 
+def test_a_browser_that_leaves_before_it_has_drawn_its_picture_gets_none(page):
+    """viser then raises, in a thread of its own, and would print a traceback into the terminal that serves."""
+
+    def leaves():
+        raise RuntimeError("the client disconnected before returning a frame")
+
+    sent = []
+    page._screens[7] = SimpleNamespace(picture=leaves, close=print)
+    page._photograph(SimpleNamespace(client=SimpleNamespace(client_id=7, send_file_download=sent.append)))
+    assert sent == []
+
+
 def test_an_instance_chosen_of_the_scene_before_lights_nothing(live, page):
     """One browser changes the scene while another chooses from its list."""
     for of_another_scene in ("1 · plum · 7", "1000 · plum · 7"):

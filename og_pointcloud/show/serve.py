@@ -202,7 +202,10 @@ class LivePage:
         client = event.client
         if client is None or client.client_id not in self._screens:
             return
-        picture = self._screens[client.client_id].picture()
+        try:
+            picture = self._screens[client.client_id].picture()
+        except RuntimeError:  # the browser has left before it drew
+            return
         file = imageio.v3.imwrite("<bytes>", picture, extension=".png")
         client.send_file_download(f"{TITLE}.png", file, save_immediately=True)
 
