@@ -53,6 +53,35 @@ def test_every_encoding_gives_the_same_vertices_with_and_without_faces(tmp_path,
     np.testing.assert_array_equal(elements["vertex"], np.array(ROWS, FIELDS))
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_vertices_with_lists_are_read_without_them(tmp_path, encoding):
+    header = (
+        f"ply\nformat {encoding} 1.0\nelement vertex 3\nproperty list uchar uint views\nproperty double x\n"
+        "property uchar red\nproperty list int float weights\nproperty list uchar short none\nproperty float y\n"
+        "element extra 1\nproperty int n\n"
+    )
+    lists = [((7, 8, 9), (0.5,), ()), ((), (0.1, 0.2), (-1,)), ((1,), (), ())]
+    expected = np.array([(1.5, 3, -2), (-0.25, 255, 0), (4e6, 0, 3)], [("x", "f8"), ("red", "u1"), ("y", "f4")])
+    rows = [
+        (len(a), *a, x, red, len(b), *b, len(c), *c, y) for (a, b, c), (x, red, y) in zip(lists, expected, strict=True)
+    ]
+    if encoding == "ascii":
+        body = "".join(" ".join(map(str, row)) + "\n" for row in [*rows, [5]]).encode()
+    else:
+        kinds = [f"{STRUCT_ORDERS[encoding]}B{len(a)}IdBi{len(b)}fB{len(c)}hf" for a, b, c in lists]
+        body = b"".join(struct.pack(kind, *row) for kind, row in zip(kinds, rows, strict=True))
+        body += struct.pack(STRUCT_ORDERS[encoding] + "i", 5)
+    path = write(tmp_path / "a.ply", header, body)
+    elements = read_ply(path)
+    assert elements["vertex"].dtype == expected.dtype
+    np.testing.assert_array_equal(elements["vertex"], expected)
+    assert elements["extra"]["n"].tolist() == [5]
+    for cut in range(8, len(body)):  # at any place: in a length, a list, or a row's end
+        write(path, header, body[:-cut])
+        with pytest.raises(SceneError, match=r"a\.ply: element 'vertex': "):
+            read_ply(path)
+
+
 def test_faces_behind_the_vertices_are_not_even_looked_at(tmp_path):
     encoding = "binary_little_endian"
     body = vertex_bytes(encoding) + face_bytes(encoding)[:5]
