@@ -221,7 +221,12 @@ def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
     refused(changed(model_type="blip"), "model_type is 'blip'; expected one of clip, siglip")
     refused(changed(quantization_config={"quant_method": "gptq"}), "quantized")
     refused(changed(text_config=3), "cannot be read")
-    refused(changed(), "pass --feature-space with the name in your scenes", feature_space=None)
+    nameless = "expected the name in your scenes .*: pass it to export text or export image with --feature-space"
+    refused(changed(), nameless, feature_space=None)
+    with pytest.raises(OgPointcloudError, match=f"{nameless}; masks takes the folder that export image makes"):
+        open_encoder(changed())
+    with pytest.raises(OgPointcloudError, match="has no config.json"):  # of a text encoder, for one
+        open_encoder(tmp_path)
     folder = changed(auto_map={"AutoModel": "evil.Model"})
     (folder / "evil.py").write_text("open('was_run', 'w')")
     clip.load_model(folder)

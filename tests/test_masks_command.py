@@ -292,6 +292,18 @@ def test_the_demo_encoder_is_not_taken_without_a_word(tmp_path, capsys):
     assert "demo room" not in capsys.readouterr().err
 
 
+def test_masks_of_nothing_are_not_handed_to_fit(tmp_path, capsys):
+    make_capture(tmp_path / "c", 2)
+    (tmp_path / "ids").mkdir()
+    for name in ("frame_00", "frame_01"):
+        cv2.imwrite(str(tmp_path / "ids" / f"{name}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert main(["masks", str(tmp_path / "c"), "--proposer", str(tmp_path / "ids"), "--encoder", "none"]) == 0
+    out, err = capsys.readouterr()
+    assert "0 masks in 2 images" in out
+    assert "next" not in out
+    assert "found nothing in any image" in err
+
+
 def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
     make_capture(tmp_path / "c", 3)
     command = ["masks", str(tmp_path / "c"), *QUICKLY]

@@ -65,4 +65,9 @@ def run(arguments: argparse.Namespace) -> None:
         "done before), "
         f"feature space {made.feature_space}"
     )
+    if not made.masks:
+        warnings.warn(
+            "the proposer found nothing in any image, and fit needs masks: try another --proposer", stacklevel=1
+        )
+        return
     print_next("fit", made.output, "-o", f"{made.output.resolve().name}.ogpc")

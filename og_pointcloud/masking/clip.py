@@ -83,8 +83,8 @@ class TransformersModel:
         attention: Attention = "sdpa",
     ) -> None:
         """feature_space: None: from the folder's configuration. Errors: as ``load_model``."""
-        self.feature_space = feature_space or published_name(folder)
         model = load_model(folder, attention)
+        self.feature_space = feature_space or published_name(folder)
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
         self.device = best_device()
         self.tower = ImageTower(model).eval().to(self.device)
@@ -123,7 +123,8 @@ def published_name(folder: StrPath) -> str:
     name = read_config(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
         raise OgPointcloudError(
-            f"{folder} does not say which model it is; pass --feature-space with the name in your scenes "
-            "(og-pointcloud info S.ogpc), such as openai/clip-vit-base-patch32 or laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+            f"{folder} does not say which model it is; expected the name in your scenes (og-pointcloud info S.ogpc), "
+            "such as openai/clip-vit-base-patch32 or laion/CLIP-ViT-B-16-laion2B-s34B-b88K: pass it to export text or "
+            "export image with --feature-space; masks takes the folder that export image makes"
         )
     return name
