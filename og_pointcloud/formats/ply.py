@@ -163,7 +163,7 @@ def _parse_header(head: bytes) -> _Header:
 def _add_property(element: _Element, words: list[str], number: int) -> None:
     """Append the property that ``words``, the rest of a header line, declares."""
     if words[0] == "list" and len(words) == 4:
-        element.lists.append((len(element.columns), *words[1:3]))
+        element.lists.append((len(element.columns), words[1], words[2]))
         return
     if len(words) != 2:
         raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
