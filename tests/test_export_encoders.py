@@ -225,7 +225,7 @@ def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
     refused(changed(), nameless, feature_space=None)
     with pytest.raises(OgPointcloudError, match=f"{nameless}; masks takes the folder that export image makes"):
         open_encoder(changed())
-    with pytest.raises(OgPointcloudError, match="has no config.json"):  # of a text encoder, for one
+    with pytest.raises(OgPointcloudError, match=r"has no config\.json"):  # of a text encoder, for one
         open_encoder(tmp_path)
     folder = changed(auto_map={"AutoModel": "evil.Model"})
     (folder / "evil.py").write_text("open('was_run', 'w')")
