@@ -9,12 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from labelled_clouds import instance_table, make_cloud
-from scenes import HEIGHT, WIDTH, write_depth
+from scenes import FEATURE_SPACE, HEIGHT, NAMES, WIDTH, write_depth
+from text_models import encoder_files, write_files
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, instance_of, moved, scene, surface
 
 import og_pointcloud as og
+from og_pointcloud.bundle.read import read_carried_encoder
+from og_pointcloud.bundle.vocabulary import carry_encoder
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping import changes as changes_module
 from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
@@ -449,6 +453,25 @@ def test_a_folder_is_read_with_its_depth_images(tiny_capture):
         write_depth(tiny_capture.folder / "depth" / f"view{k}.png", np.full((HEIGHT, WIDTH), 0.5))
     with pytest.raises(SceneError, match="0 are where they were"):
         og.update(before, tiny_capture.folder, progress=False)
+
+
+def test_a_visit_adds_its_words_and_a_carried_text_encoder_stays(tiny_capture, tmp_path):
+    folder, before, after = tiny_capture.folder, tmp_path / "before.ogpc", tmp_path / "after.ogpc"
+    assert main(["fit", str(folder), "-o", str(before)]) == 0
+    width = og.load(before).cloud.instances.descriptors.shape[1]
+    carry_encoder(before, write_files(tmp_path / "encoder", encoder_files(FEATURE_SPACE, width)))
+    vectors = np.eye(2, width, dtype=np.float32)
+    np.savez(folder / "text_features.npz", names=["vase", NAMES[0]], vectors=vectors, feature_space=FEATURE_SPACE)
+    assert main(["update", str(before), str(folder), "-o", str(after)]) == 0
+    known, words = og.load(before).vocabulary.names, og.load(after).vocabulary
+    assert words.names == (*known, "vase")
+    np.testing.assert_array_equal(words.vectors[[-1, known.index(NAMES[0])]], vectors)
+    assert read_carried_encoder(after) == read_carried_encoder(before) is not None
+    mapper, capture = og.Mapper(after), og.read_capture(folder)
+    for view in capture.views:
+        camera = in_local_frame(view.camera, -capture.points.origin)
+        mapper.integrate(og.Frame(camera, view.mask_map(), view.mask_features))
+    assert read_carried_encoder(mapper.save(tmp_path / "later.ogpc")) == read_carried_encoder(before)
 
 
 def test_a_map_without_points_is_refused(monday):

@@ -109,13 +109,18 @@ def add_words(path: StrPath, words: Vocabulary, feature_space: str, output: StrP
         old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
         if old.names:  # if no instance has a descriptor, they alone tell the width of the space
             FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
-        vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))
-        # For a word in both, the later vector stays.
-        vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
-        merged = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
+        merged = all_words(old, words)
         counts = {**bundle.manifest["counts"], "words": len(merged.names)}
         _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(merged))
     return merged
+
+
+def all_words(old: Vocabulary, new: Vocabulary) -> Vocabulary:
+    """The words of both, with unit vectors of one width; a word that both have gets the new one's."""
+    vectors = {}
+    for words in (old, new):
+        vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
+    return Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
 
 
 def read_bank(path: StrPath) -> tuple[WordBank, str]:
@@ -141,8 +146,8 @@ def store_bank(path: StrPath, bank: WordBank, feature_space: str, output: StrPat
 def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None) -> TextEncoder:
     """Store a text encoder in a .ogpc file, which can then answer any word on any machine. Returns the encoder.
 
-    folder: written by ``og-pointcloud export text``; a file without a word bank gets the encoder's. output: as for
-    ``add_words``.
+    folder: written by ``og-pointcloud export text``, or a .ogpc that carries an encoder; a file without a word bank
+    gets the encoder's. output: as for ``add_words``.
     """
     with changing(path):
         bundle = read_bundle(path)
@@ -151,6 +156,12 @@ def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None)
             members |= bank_members(encoder.word_bank)
         _rewrite(path, output, bundle.manifest, members)
     return encoder
+
+
+def keep_encoder(path: StrPath, earlier: StrPath | None) -> None:
+    """Store the text encoder of an earlier .ogpc, if it carries one, in the .ogpc that was made from it."""
+    if earlier is not None and read_carried_encoder(earlier):
+        carry_encoder(path, earlier)
 
 
 def carried_encoder(path: StrPath | None) -> CarriedEncoder:
@@ -174,11 +185,12 @@ def _carried_once(path: Path, _modified: int) -> TextEncoder | None:
     return TextEncoder(files, f"{path}: text_encoder") if files else None
 
 
-def encoder_members(folder: StrPath, space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
-    """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
-    files = ENCODER.read(Path(folder))
-    encoder = TextEncoder(files, str(folder))
-    space.require(FeatureSpace(encoder.feature_space, encoder.width), f"texts that {folder} encodes")
+def encoder_members(source: StrPath, space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
+    """An encoder's files, of a folder or of a .ogpc that carries one, as members of a .ogpc of this feature space;
+    FeatureSpaceError if it is of another."""
+    files = (Path(source).is_file() and read_carried_encoder(source)) or ENCODER.read(Path(source))
+    encoder = TextEncoder(files, str(source))
+    space.require(FeatureSpace(encoder.feature_space, encoder.width), f"texts that {source} encodes")
     return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder
 
 

@@ -30,17 +30,15 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
-    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.bundle.vocabulary import keep_encoder
     from og_pointcloud.mapping.merging import update
-    from og_pointcloud.mapping.sight import depth_views
 
     before = load(arguments.map)
     journal = Journal(progress=False)
-    with journal.stage("read capture"):
-        capture = read_capture(arguments.capture, gaussians=arguments.gaussians)
     with journal.stage("update"):
-        updated = update(before, capture, depth=depth_views(arguments.capture, before.cloud.origin))
+        updated = update(before, arguments.capture, gaussians=arguments.gaussians)
     write_fit(updated.cloud, journal, arguments.output)
+    keep_encoder(arguments.output, arguments.map)
     if arguments.json:
         write_json(arguments.json, updated.changes.to_dict())
     print_changes(updated.changes)

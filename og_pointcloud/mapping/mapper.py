@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.bundle.vocabulary import keep_encoder
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.points import read_points
@@ -105,7 +106,8 @@ class Mapper:
             raise SceneError(f"spacing is {spacing:g}, but a map or a cloud is given, which has its own: leave it out")
         self.settings = fit_settings(settings)
         self._space, self._spacing = FeatureSpace(feature_space), spacing
-        self._base = None if start is None else as_scene(start).cloud
+        scene = None if start is None else as_scene(start)
+        self._base, self._base_file = (scene.cloud, scene.path) if scene else (None, None)
         self._map: GrowingMap | None = None
         self._neighborhood: Neighborhood | None = None  # of a known cloud
         self._rows = np.zeros(0, np.int64)  # of its points, in their order
@@ -269,10 +271,12 @@ class Mapper:
         return self._changes
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the snapshot as .ogpc, whole or not at all."""
+        """Write the snapshot as .ogpc, whole or not at all, with the text encoder that the continued map has."""
         from importlib import import_module
 
-        return import_module("og_pointcloud_export").write_bundle(self.snapshot().cloud, path)
+        written = import_module("og_pointcloud_export").write_bundle(self.snapshot().cloud, path)
+        keep_encoder(written, self._base_file)
+        return written
 
     def correct(self, poses: Mapping[float, ArrayLike]) -> None:
         """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world

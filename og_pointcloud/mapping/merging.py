@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
+from og_pointcloud.bundle.vocabulary import SceneWords, all_words, scene_words
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
@@ -50,6 +51,7 @@ def update(
     capture: Scene | str | Path,
     *,
     depth: Iterable[MeasuredView] | None = None,
+    gaussians: str | Path | None = None,
     settings: FitSettings | None = None,
     progress: bool = True,
 ) -> Updated:
@@ -57,20 +59,24 @@ def update(
 
     capture: a folder, or a scene, in the map's world frame, with points of its own. depth: what its views measured, in
     the map's local frame (`sight.depth_views`); None: the folder's depth images, if there are any, else its points take
-    the place of depth. FeatureSpaceError for masks of another encoder, SceneError for a capture that does not lie where
-    the map does. The given map is not changed: the new one is a copy.
+    the place of depth. gaussians: geometry to use instead of the folder's own. The map gets the folder's words too, and
+    its word bank if it has none. FeatureSpaceError for masks of another encoder, SceneError for a capture that does not
+    lie where the map does. The given map is not changed: the new one is a copy.
 
     >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
     """
     cloud = as_scene(before).cloud
-    if isinstance(capture, (str, Path)):
-        depth = depth_views(capture, cloud.origin) if depth is None else depth
-        capture = read_capture(capture)
+    folder = capture if isinstance(capture, (str, Path)) else None
+    if folder is not None:
+        depth = depth_views(folder, cloud.origin) if depth is None else depth
+        capture = read_capture(folder, gaussians=gaussians)
     if not isinstance(capture, Scene):
         raise SceneError(f"capture is a {type(capture).__name__}; expected a folder, or a Scene that was read from one")
-    cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
-    visit = fit(capture, settings, progress=progress)
+    space = FeatureSpace(capture.feature_space, capture.feature_width)
+    cloud.space.require(space, "masks of the capture")
+    words = scene_words(space, capture=folder) if folder is not None else SceneWords()
+    visit = words.added_to(fit(capture, settings, progress=progress))
     earlier, later = Visit(cloud), Visit.in_frame_of(cloud, visit, depth)
     return merge(earlier, later, compare_visits(earlier, later, progress=progress), capture.name)
 
@@ -92,6 +98,7 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     def both(first: NDArray[Any] | None, second: NDArray[Any] | None) -> NDArray[Any] | None:
         return None if first is None or second is None else np.concatenate([first[stays], second[adds]])
 
+    words = [cloud.vocabulary for cloud in (a, b) if cloud.vocabulary]
     colors = [np.full((len(cloud), 3), UNKNOWN_COLOR, np.uint8) if cloud.rgb is None else cloud.rgb for cloud in (a, b)]
     merged = replace(
         a,
@@ -101,6 +108,8 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
         feature_space=b.feature_space if a.feature_space == UNKNOWN_SPACE else a.feature_space,
         rgb=None if a.rgb is None and b.rgb is None else both(*colors),
         certainty=both(a.certainty, b.certainty),
+        vocabulary=all_words(*words) if len(words) == 2 else next(iter(words), None),
+        word_bank=a.word_bank or b.word_bank,
         provenance=record.added_to(a.provenance),
         cameras=(*a.cameras, *b.cameras)[-MAX_CAMERAS:],
     )
