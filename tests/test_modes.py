@@ -96,7 +96,7 @@ def test_leaves_are_decided_on_largest_first_whatever_their_numbers(monkeypatch:
     """Where masks of two overlap, the smaller one may have a point: which is smaller goes by number."""
     prepared = prepare(boxes_on_a_table().scene)
     given, books = [], []
-    decide, build = labellers.assign_and_mark_spanning, labellers.two_level_codebook
+    decide, build = labellers.assign_and_correct_groups, labellers.two_level_codebook
 
     def renumbered(*arguments: Any) -> Codebook:
         book = build(*arguments)
@@ -108,7 +108,7 @@ def test_leaves_are_decided_on_largest_first_whatever_their_numbers(monkeypatch:
         return books[-1]
 
     monkeypatch.setattr(labellers, "two_level_codebook", renumbered)
-    monkeypatch.setattr(labellers, "assign_and_mark_spanning", lambda *a: given.append(a[2].group) or decide(*a))
+    monkeypatch.setattr(labellers, "assign_and_correct_groups", lambda *a: given.append(a[2].group) or decide(*a))
     settings = FitSettings(codebook=CodebookSettings(k1=3))
     found = [fast(prepared.table, prepared.surface, settings, Journal(False)) for _ in range(3)]
     for groups, book in zip(given, books, strict=True):

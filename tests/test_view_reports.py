@@ -16,7 +16,7 @@ from test_membership import decide, groups, on_a_line, torn_case
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import Membership, assign_and_mark_spanning, assign_points
+from og_pointcloud.fitting.membership import Membership, assign_and_correct_groups, assign_points
 from og_pointcloud.fitting.view_reports import MIN_REPORT_PROBABILITY, PRIOR_COUNT
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import neighborhood
@@ -55,7 +55,7 @@ def test_masks_that_swallow_a_thing_tell_of_neither_once_points_have_chosen() ->
     table = hand_table(N, [KNOWS] * 2 + [both] * 3)
     before = MaskGroups(np.array([0, 1, 0, 1, 0, 0, 1], np.int32), 2, np.zeros(7, bool))
     around, settings = neighborhood(on_a_line(N), GeometrySettings()), FitSettings()
-    known, found = assign_and_mark_spanning(table, view_votes(table), before, around, settings)
+    known, found = assign_and_correct_groups(table, view_votes(table), before, around, settings)
     assert known.spanning.tolist() == [False] * 4 + [True] * 3
     assert known.group.tolist() == before.group.tolist()
     assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
@@ -65,7 +65,7 @@ def test_masks_that_swallow_a_thing_tell_of_neither_once_points_have_chosen() ->
 def test_where_no_mask_spans_two_things_points_choose_once() -> None:
     table = hand_table(N, [KNOWS] * 3)
     before, around = groups([0, 1] * 3), neighborhood(on_a_line(N), GeometrySettings())
-    known, found = assign_and_mark_spanning(table, view_votes(table), before, around, FitSettings())
+    known, found = assign_and_correct_groups(table, view_votes(table), before, around, FitSettings())
     assert known is before
     assert found.instance_ids.tolist() == [0] * 20 + [1] * 20 + [0] * 20
 

@@ -66,7 +66,7 @@ def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np
     shown = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     usable = ~spanning & (shown > 0)
     group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
-    return MaskGroups(*_ordered(group, shown), spanning)
+    return MaskGroups(*ordered(group, shown), spanning)
 
 
 def with_spanning(
@@ -350,8 +350,11 @@ def _roots(group: NDArray[np.int64]) -> NDArray[np.int64]:
         group = parent
 
 
-def _ordered(group: NDArray[np.int64], shown: NDArray[np.floating]) -> tuple[NDArray[np.int32], int]:
-    """Renumber groups by the mass they show, largest first (ties: lowest mask first)."""
+def ordered(group: NDArray[np.integer], shown: NDArray[np.floating]) -> tuple[NDArray[np.int32], int]:
+    """The group of each mask, numbered by the mass that groups show, largest first (ties: the lower), and their number.
+
+    group: (masks,) any numbers below that of masks, -1 none. shown: (masks,) the mass that each shows.
+    """
     roots = np.unique(group[group >= 0])
     mass = np.bincount(group[group >= 0], shown[group >= 0], len(group))[roots]
     order = roots[np.lexsort((roots, -mass))]

@@ -33,7 +33,7 @@ from og_pointcloud.fitting.learned.matching import (
 )
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.membership import assign_and_mark_spanning
+from og_pointcloud.fitting.membership import assign_and_correct_groups
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -208,7 +208,8 @@ def _decided_by_views(
     """
     with journal.stage("membership"):
         rgb = surface.scene.points.rgb
-        groups, membership = assign_and_mark_spanning(table, votes, groups, surface.neighborhood, settings, rgb)
+        before = groups.group
+        groups, membership = assign_and_correct_groups(table, votes, groups, surface.neighborhood, settings, rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     if membership.dismissed.any():
@@ -220,7 +221,9 @@ def _decided_by_views(
         used, ids, mask_instance = renumbered(by_look(votes, ids, looks), looks.look)
         instances = instances_of_groups(table, mask_instance, ids, len(used))
         if coarse is not None:
-            instances = replace(instances, coarse=coarse[looks.group[used]])
+            of_group = np.full(groups.count, len(coarse))
+            np.minimum.at(of_group, groups.group[before >= 0], before[before >= 0])  # its largest leaf
+            instances = replace(instances, coarse=coarse[of_group[looks.group[used]]])
     expected_iou = membership.expected_iou[looks.group[used]]
     return Labelling(ids, instances, mask_instance, membership.certainty, expected_iou)
 

@@ -45,6 +45,7 @@ from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import MAX_COLOR_RATIO, color_ratios, outline_ratios
+from og_pointcloud.fitting.fragments import join_fragments
 from og_pointcloud.fitting.grouping import MaskGroups, with_spanning
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_reports import ViewReports, likely_states
@@ -80,7 +81,7 @@ class Membership:
     scene: SceneVotes
 
 
-def assign_and_mark_spanning(
+def assign_and_correct_groups(
     table: MaskTable,
     votes: ViewVotes,
     groups: MaskGroups,
@@ -88,14 +89,16 @@ def assign_and_mark_spanning(
     settings: FitSettings,
     rgb: NDArray[np.uint8] | None = None,
 ) -> tuple[MaskGroups, Membership]:
-    """Decide the state of every point of a scene, mark the masks that these states show to span two groups, and decide
-    once more. Returns the groups with these masks marked, too."""
+    """Decide the state of every point of a scene, correct the groups by what these states show (which are pieces of one
+    thing, and which masks span two), and decide once more. Returns the corrected groups, too."""
     inputs = around, settings.membership, rgb
     first = assign_points(table, votes, groups, *inputs)
-    marked = with_spanning(groups, votes, table.mask_view, first.instance_ids, settings.grouping)
-    if (marked.spanning == groups.spanning).all():
+    visibility = _visibility(votes.openness, settings.membership.open_share * votes.typical_openness)
+    joined, ids = join_fragments(groups, table, votes, first.instance_ids, around, visibility)
+    corrected = with_spanning(joined, votes, table.mask_view, ids, settings.grouping)
+    if corrected.count == groups.count and (corrected.spanning == groups.spanning).all():
         return groups, first
-    return marked, assign_points(table, votes, marked, *inputs)
+    return corrected, assign_points(table, votes, corrected, *inputs)
 
 
 def assign_points(

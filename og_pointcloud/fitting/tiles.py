@@ -41,7 +41,7 @@ from og_pointcloud.fitting.mask_table import (
     stacked_tracks,
     view_fingerprint,
 )
-from og_pointcloud.fitting.membership import SceneVotes, assign_and_mark_spanning, assign_points
+from og_pointcloud.fitting.membership import SceneVotes, assign_and_correct_groups, assign_points
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.see_through import without_see_through
@@ -424,7 +424,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     groups = group_masks(table, settings.grouping)
     points = cloud.points.take(sample)
     around = neighborhood(points.xyz, settings.geometry)
-    groups, judged = assign_and_mark_spanning(table, votes, groups, around, settings, points.rgb)
+    groups, judged = assign_and_correct_groups(table, votes, groups, around, settings, points.rgb)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     # Groups without a sure point in the sample have rate 0: the tiles know more about these.
