@@ -219,7 +219,7 @@ def test_nothing_is_left_behind_when_writing_fails(tmp_path):
 def test_no_zip(tmp_path, content):
     (tmp_path / "s.ogpc").write_bytes(content)
     refuse(tmp_path / "s.ogpc", "not a .ogpc file, or damaged")
-    refuse(tmp_path / "s.ogpc", "a cloud or splat alone is not a scene")
+    refuse(tmp_path / "s.ogpc", "stored members: copy the file again, or make it again .og-pointcloud fit.; a cloud or")
 
 
 def test_a_zip_of_something_else(tmp_path):

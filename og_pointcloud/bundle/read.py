@@ -112,8 +112,8 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
     except ZIP_ERRORS as error:
         raise _Refused(
-            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
-            f"{ogpc.REBUILD}; a cloud or splat alone is not a scene: og-pointcloud fit makes one from a capture"
+            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: {ogpc.REBUILD}; a "
+            "cloud or splat alone is not a scene: og-pointcloud fit makes one from a capture"
         ) from None
 
 
