@@ -95,13 +95,14 @@ def test_a_folder_of_other_files_is_no_map_and_stays(tmp_path, capsys, more):
 
 def test_reasons_that_are_not_shown_are_counted(tmp_path, capsys, monkeypatch):
     given = [
-        replace(frame, features=frame.features[:, :k]) if k else frame for k, frame in enumerate(frames(THINGS)[:6])
+        replace(frame, features=frame.features[:, :k] if k < 4 else frame.features[:1]) if k else frame
+        for k, frame in enumerate(frames(THINGS)[:6])
     ]
     monkeypatch.setattr(map_, "SHOWN", 2)
     _, _, said = run(capsys, "map", write_bag(tmp_path / "drive", given), "-o", tmp_path / "room.ogpc")
-    assert [line for line in said.splitlines() if line.startswith("left out: ")][2:] == [
-        "left out: 3 more, for 3 other reasons"
-    ]
+    lines = [line for line in said.splitlines() if line.startswith("left out: ")]
+    assert "mask features of frame 2 are" in lines[0]  # the only one of its width, so by its name
+    assert lines[2:] == ["left out: 3 more, for 2 other reasons"]
 
 
 def test_where_no_frame_is_taken_it_is_said_why_and_nothing_is_left(tmp_path, capsys):
@@ -144,6 +145,20 @@ def test_frames_of_a_bag_are_those_that_were_recorded(tmp_path):
         np.testing.assert_array_equal(read.masks, frame.masks)
         np.testing.assert_array_equal(read.rgb, frame.rgb)
         np.testing.assert_array_equal(read.features, frame.features)
+
+
+def test_masks_and_features_of_different_stamps_are_counted(tmp_path):
+    def shifted(make, frame):
+        messages = messages_of(make, frame)
+        messages["masks"].header.stamp.nanosec += 1
+        return messages
+
+    bag = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:3], messages=shifted))
+    assert [frame.features for frame in bag] == [None] * 3
+    assert bag.dropped == {
+        f"{one} came without {other} of the same stamp: give both the stamp of their image": 3
+        for one, other in (("masks", "features"), ("features", "masks"))
+    }
 
 
 def beside_a_raw_image(make, frame):

@@ -190,7 +190,10 @@ def bad_frames():
         "another encoder": replace(frame, feature_space="another encoder"),
         "dimension 7": replace(frame, features=np.ones((len(frame.features), 7), np.float32)),
         "contains NaN": replace(frame, features=frame.features * np.nan),
-        "times what the map expects": replace(frame, depth=1000 * frame.depth),
+        "its depths are about 2000 times what the map expects": replace(frame, depth=2000 * frame.depth),
+        r"frame 1700000000.25: mask id \d has no feature row; .*: there are 1": replace(
+            frame, features=frame.features[:1], stamp=1_700_000_000.25
+        ),
         "mask image is": replace(frame, masks=frame.masks[:-1]),
         "masks are float64": replace(frame, masks=frame.masks.astype(float)),
         "depth is float32": replace(frame, depth=frame.depth[1:]),
@@ -305,7 +308,7 @@ def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
 def test_masks_without_any_geometry_are_refused():
     with pytest.raises(SceneError, match="no points yet"):
         og.Mapper().integrate(without_depth(frames(THINGS))[0])
-    with pytest.raises(SceneError, match="integrate some first"):
+    with pytest.raises(SceneError, match="no frame with masks has shown any point"):
         og.Mapper().snapshot()
 
 

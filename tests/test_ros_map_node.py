@@ -102,14 +102,16 @@ def test_what_waits_too_long_is_used_as_it_is_or_dropped(module, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     node = module.MapNode()
-    first, second = frames(BEFORE)[:2]
+    first, second, third = frames(BEFORE)[:3]
     send(node, [first], without=("masks", "features"))
     send(node, [second], placed=False)
+    send(node, [third], without=("depth", "masks"))
     assert settled(node)._queue.mapper.points == 0
     now[0] += 61.0
     node.timers[0]()
     assert settled(node)._queue.mapper.points > 0  # depth alone is a frame
     assert any("transform did not arrive" in text for text in warnings(node))
+    assert any("features came without masks of the same stamp" in text for text in warnings(node))
     assert not node._assembler.waiting
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections import Counter
+from collections import defaultdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -59,7 +59,7 @@ def saved_map(arguments: argparse.Namespace, work: Path) -> tuple[Mapper, int]:
 
     from og_pointcloud.mapping.mapper import Mapper
 
-    frames, refused, taken = BagFrames(arguments.bag, arguments.frame), Counter[str](), 0
+    frames, refused, taken = BagFrames(arguments.bag, arguments.frame), defaultdict[str, list[str]](list), 0
     with Mapper(arguments.start, feature_space=arguments.feature_space, journal=work) as mapper:
         for frame in tqdm(frames, desc="frames", disable=None, leave=False):
             if arguments.resume and frame.stamp is not None and mapper.holds(frame.stamp):
@@ -68,8 +68,10 @@ def saved_map(arguments: argparse.Namespace, work: Path) -> tuple[Mapper, int]:
                 mapper.integrate(frame)
                 taken += 1
             except OgPointcloudError as error:
-                refused[str(error)] += 1
-        print_left_out([*frames.dropped.items(), *refused.items()])
+                # What many frames have in common is said once, without their names.
+                refused[str(error).replace(f"frame {frame.stamp or 0:.15g}", "a frame")].append(str(error))
+        reasons = {said[0] if len(said) == 1 else why: len(said) for why, said in refused.items()}
+        print_left_out([*frames.dropped.items(), *reasons.items()])
         if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
             shutil.rmtree(work)
         mapper.save(arguments.output)

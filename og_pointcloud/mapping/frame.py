@@ -89,7 +89,7 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
     stamp = stamp if frame.stamp is None else frame.stamp
     if not isinstance(stamp, Real) or not np.isfinite(stamp):
         raise SceneError(f"frame stamp is {stamp!r}; expected a finite number: seconds, or a count")
-    name = f"frame {stamp:g}"
+    name = f"frame {stamp:.15g}"
     if frame.camera is None:
         raise SceneError(f"{name} has no camera; expected an og.Camera with its pose: drop frames that lost track")
     if not isinstance(frame.camera, Camera):
@@ -134,6 +134,11 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
                 f"{name}: masks are {ids.dtype} {ids.shape}; expected whole numbers of shape ({camera.height}, "
                 f"{camera.width}): rows of features, -1 outside of masks"
             )
+    if ids.max(initial=-1) >= len(features):
+        raise SceneError(
+            f"{name}: mask id {ids.max()} has no feature row; expected one for each id: there are {len(features)}, "
+            "counted from 0"
+        )
     view = View(name, camera, ids, features)  # checks sizes, ids and finite rows
     return np.maximum(view.mask_map(), -1), features
 
@@ -179,13 +184,15 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     # The same factor nearly everywhere means another unit of length; other causes cannot be told apart.
     low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])
     if high - low < MAX_RATIO_SPREAD * middle and max(middle, 1 / middle) > OTHER_UNIT_RATIO:
-        what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
+        what = (
+            f"its depths are about {float(f'{middle:.3g}'):g} times what the map expects: give them in the map's unit"
+        )
     else:
         what = (
             "its pose is off, it shows another place, or something blocks the camera: check these, or correct "
             "the map after a loop closure"
         )
     raise SceneError(
-        f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} map points in front of it; expected "
-        f"at least {MIN_AGREEING_SHARE:.0%}: {what}"
+        f"frame {stamp:.15g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} map points in front of it; "
+        f"expected at least {MIN_AGREEING_SHARE:.0%}: {what}"
     )

@@ -260,7 +260,7 @@ class Mapper:
         """
         map_ = self._map
         if map_ is None or not map_.kept.views:
-            raise SceneError("no frame with masks has shown any point of the map yet: integrate some first")
+            raise SceneError("no frame with masks has shown any point of the map yet; expected at least one")
         if self._labelled is None or self._labelled[0] != map_.sequence:
             self._labelled = map_.sequence, LabelledScene.from_cloud(self._label(map_))
         return self._labelled[1]
@@ -310,7 +310,7 @@ class Mapper:
             valid = checked(frame, origin, self._space, 0.0)
             if valid.view is None:
                 raise SceneError(
-                    f"frame {valid.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
+                    f"frame {valid.stamp:.15g} has no depth, and the map has no points yet; expected depth or a cloud: "
                     "if frames only have masks, start with Mapper(cloud=points) or with a map"
                 )
             # From the original pixels: a sparse image is read with larger ones, but many frames fill the gaps.

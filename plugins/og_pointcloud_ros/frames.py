@@ -96,6 +96,14 @@ class FrameAssembler:
         parts = self.waiting[stamp]
         return self._info is not None and all(getattr(parts, role) is not None for role in self.required)
 
+    def unpaired(self, stamp: int) -> str:
+        """Why the masks or features of a stamp cannot be used, as the other is missing; empty if neither is."""
+        parts = self.waiting[stamp]
+        if (parts.masks is None) == (parts.features is None):
+            return ""
+        one, other = ("masks", "features") if parts.features is None else ("features", "masks")
+        return f"{one} came without {other} of the same stamp: give both the stamp of their image"
+
     def frame(self, stamp: int, pose: Callable[[str, int], NDArray[np.float64]]) -> Frame | None:
         """The frame of a stamp, from what has arrived; None without depth or masks with features. Call `forget` after
         use.

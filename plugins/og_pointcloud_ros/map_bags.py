@@ -28,7 +28,8 @@ MAX_PENDING_STAMPS = 100
 
 
 class BagFrames:
-    """Iterates over the frames of a bag. frame: the map's frame in tf. dropped: reason -> number of unusable frames.
+    """Iterates over the frames of a bag. frame: the map's frame in tf. dropped: reason -> number of frames
+    and messages that cannot be used.
 
     SceneError if the bag has no depth, no masks, no features, no camera_info, or several of which none has the depth's
     frame_id.
@@ -63,6 +64,8 @@ class BagFrames:
 
     def _made(self, stamp: int, assembler: FrameAssembler, tree: TransformTree) -> Iterator[Frame]:
         """The frame of a stamp, or none if it shows nothing or is dropped; the stamp is forgotten in any case."""
+        if unpaired := assembler.unpaired(stamp):
+            self.dropped[unpaired] += 1
         try:
             if (frame := assembler.frame(stamp, partial(tree.lookup, self.frame))) is not None:
                 yield frame

@@ -81,6 +81,8 @@ class MapNode(PlacedNode):
                 self._warn(f"a frame was dropped: its transform did not arrive within {self._max_age} s: {error}")
             except Exception as error:
                 self._warn(f"a frame was dropped: {error_text(error)}")
+            if unpaired := self._assembler.unpaired(stamp):
+                self._warn(unpaired)
             self._assembler.forget(stamp)
 
     def _pose_at(self, frame_id: str, stamp: int) -> Any:
