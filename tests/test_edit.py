@@ -219,12 +219,13 @@ def real_harmonics(directions, count):
     return np.stack(columns, axis=1)
 
 
-def colors_seen(rows, directions):
-    """(directions, n, 3) colors of a 3DGS file's splats, straight from the definition."""
+def colors_seen(rows, directions, most=None):
+    """(directions, n, 3) colors of a 3DGS file's splats, straight from the definition. most: harmonics that count."""
     count = sum(name.startswith("f_rest_") for name in rows.dtype.names) // 3
     base = stacked(rows, BASE)[:, :, None]
     rest = stacked(rows, [f"f_rest_{k}" for k in range(3 * count)]).reshape(-1, 3, count) if count else base[:, :, :0]
-    return 0.5 + np.einsum("nck,dk->dnc", np.concatenate([base, rest], axis=2), real_harmonics(directions, count))
+    known = np.concatenate([base, rest[:, :, :most]], axis=2)
+    return 0.5 + np.einsum("nck,dk->dnc", known, real_harmonics(directions, known.shape[2] - 1))
 
 
 def some_directions(count=20):
@@ -346,6 +347,19 @@ def test_inserted_splats_stand_in_the_other_frame(tmp_path):
     for name in ("opacity", "ins_feat_r", "label"):
         np.testing.assert_array_equal(new[name], other[name])
     assert (done.points, done.changed, done.notes) == (50, 20, ())
+
+
+@pytest.mark.parametrize(("base_degree", "other_degree"), [(3, 1), (2, 0), (1, 3), (0, 2)])
+def test_inserted_splats_of_another_degree_keep_their_colors(tmp_path, base_degree, other_degree):
+    """In a file of degree 1 green begins at f_rest_3, in one of degree 3 at f_rest_15."""
+    files = tmp_path / "base.ply", tmp_path / "other.ply"
+    for path, degree, seed in zip(files, (base_degree, other_degree), (1, 2), strict=True):
+        write_ply(path, {"vertex": join_columns(gaussian_columns(np.eye(3), degree, seed))})
+    done = og.edit.insert(*files, tmp_path / "out.ply")
+    directions, room_for = some_directions(), (base_degree + 1) ** 2 - 1
+    expected = colors_seen(vertices(files[1]), directions, room_for)
+    np.testing.assert_allclose(colors_seen(vertices(done.path)[3:], directions), expected, atol=1e-6)
+    assert len(done.notes) == (other_degree > base_degree)
 
 
 def covariances(rows):

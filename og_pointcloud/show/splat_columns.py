@@ -80,7 +80,7 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The rows of both, with the columns of the first; and notes of what was lost. If the two have colors in different
     columns or types, both become bytes. Positions become float64 if the first's type would move points
     (`storable_positions`)."""
-    first, second = _columns(base), _columns(added)
+    first, second = _columns(base), _with_harmonics(added, _rest_names(base))
     places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
     first |= {axis: first[axis].astype(np.promote_types(first[axis].dtype, places)) for axis in "xyz"}
     zeros, notes = np.zeros(len(added)), []
@@ -92,7 +92,7 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     }
     if lacking := [name for name in first if name not in second]:
         notes.append(f"{_listed(lacking)} are 0 for the inserted points, which lack them")
-    if dropped := [name for name in second if name not in first]:
+    if dropped := [name for name in _columns(added) if name not in first]:
         notes.append(f"{_listed(dropped)} of the inserted points are left out: the cloud does not have them")
     return join_columns(merged), tuple(notes)
 
@@ -161,6 +161,15 @@ def _rest(rows: Rows) -> DoubleArray:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
     values = stack_columns(rows, _rest_names(rows))
     return values.reshape(len(values), 3, values.shape[1] // 3)
+
+
+def _with_harmonics(rows: Rows, names: Sequence[str]) -> Columns:
+    """The columns with these names for the harmonics: those that the rows lack are 0, higher ones are left out. Which
+    one a column holds depends on the file's degree: f_rest_3 is green's first of degree 1, and red's fourth of 3."""
+    rest, count = _rest(rows), len(names) // 3
+    fitted = np.pad(rest, ((0, 0), (0, 0), (0, max(0, count - rest.shape[2]))))[..., :count]
+    others = {name: column for name, column in _columns(rows).items() if name not in _rest_names(rows)}
+    return others | dict(zip(names, fitted.reshape(len(rows), len(names)).T, strict=True))
 
 
 # Harmonics --------------------------------------------------------------------------------------------------------
