@@ -254,7 +254,8 @@ MUTATIONS = (
     ),
     Mutation(
         "points are not asked which masks span things", "fitting/membership.py",
-        "if (marked.spanning == groups.spanning).all():", "if True:", ("test_view_reports.py",),
+        "if corrected.count == groups.count and (corrected.spanning == groups.spanning).all():", "if True:",
+        ("test_view_reports.py",),
     ),
     Mutation(
         "crumbs make masks span", "fitting/grouping.py",
@@ -395,6 +396,16 @@ MUTATIONS = (
         "an atlas that changed is not read again", "collection/collection.py",
         "if stamp and stamp == self._stamp:", "if stamp and self._stamp:",
         ("test_collection.py::test_an_open_collection_notices_a_changed_atlas",),
+    ),
+    Mutation(
+        "pieces of things stay pieces", "fitting/fragments.py",
+        "if not joined.any():", "if joined is not None:",
+        ("test_fragments.py::test_pieces_that_a_table_parts_in_every_view_are_one_thing",),
+    ),
+    Mutation(
+        "a border that tells nothing joins", "fitting/fragments.py",
+        "across = float(np.clip(np.median(share[seen & ~inside & ~alike]), MIN_SHARE, within))", "across = MIN_SHARE",
+        ("test_fragments.py::test_two_things_stay_two",),
     ),
     Mutation(
         "ids between ids are believed", "checking/check.py",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.evaluate.metrics import adjusted_rand_index, score_labels
+from og_pointcloud.evaluate.metrics import adjusted_rand_index, matched_shares, score_labels
 
 
 def test_score_by_hand():
@@ -67,3 +67,36 @@ def test_adjusted_rand_index_of_equal_partitions_is_one():
     assert adjusted_rand_index(ids, 7 - 3 * ids) == pytest.approx(1.0)
     assert adjusted_rand_index(np.zeros(4, int), np.zeros(4, int)) == 1.0
     assert math.isnan(adjusted_rand_index(ids[:0], ids[:0]))
+
+
+@pytest.mark.parametrize(
+    ("ids", "things", "expected"),
+    [
+        ([0] * 4 + [1] * 4, [5] * 4 + [3] * 4, (1, 1)),  # whatever the numbers
+        ([0] * 8, [0] * 4 + [1] * 4, (0, 0)),  # half of each is no match
+        ([0] * 8, [0] * 5 + [1] * 3, (0.5, 1)),
+        ([0] * 3 + [1] * 5, [0] * 8, (1, 0.5)),  # a piece beside it
+        ([0] * 3 + [-1] * 5, [0] * 4 + [-1] * 4, (1, 1)),
+        ([0] * 8, [0] * 4 + [-1] * 4, (0, 0)),  # background counts in the union
+        ([0] * 4 + [1], [0] * 4 + [1], (1, 1)),  # the small ones are not asked for
+        ([-1, -2], [-1, -1], (np.nan, np.nan)),
+    ],
+)
+def test_instances_match_things_with_more_than_half_of_their_union(
+    ids: list[int], things: list[int], expected: tuple[float, float]
+):
+    assert matched_shares(np.array(ids), np.array(things), min_points=2) == pytest.approx(expected, nan_ok=True)
+
+
+def test_matched_shares_are_those_of_the_literal_reference():
+    random = np.random.default_rng(0)
+    things = random.integers(-1, 6, 400)
+    ids = np.where(random.uniform(size=400) < 0.6, 5 - np.maximum(things, -1), random.integers(-2, 9, 400))
+    sets = [{int(key): set(np.flatnonzero(part == key)) for key in set(part) - {-1, -2}} for part in (ids, things)]
+    large = [[points for points in of.values() if len(points) >= 20] for of in sets]
+    shares = []
+    for asked, others in ((large[1], sets[0]), (large[0], sets[1])):
+        best = [max(len(one & other) / len(one | other) for other in others.values()) for one in asked]
+        shares.append(np.mean([iou > 0.5 for iou in best]))
+    assert matched_shares(ids, things, min_points=20) == pytest.approx(shares)
+    assert 0 < shares[1] < shares[0] < 1

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import og_pointcloud as og
+from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.captures import Answer, ask
 from og_pointcloud.evaluate.intervals import miou_interval
 from og_pointcloud.evaluate.knobs import changed
+from og_pointcloud.evaluate.metrics import matched_shares
 from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
 from og_pointcloud.formats.capture import read_capture
@@ -38,7 +40,8 @@ class Row:
     over all cores, which other work on the machine affects less. worse: how the scene was made worse before the fit, as
     "views=5".
 
-    reliability: the fit's own, in [0, 1]. baseline: the best one, None if none was measured; gain: our mIoU less the
+    recall, precision: of instances (`matched_shares`), None where the truth has no things. reliability: the fit's own,
+    in [0, 1]. baseline: the best one, None if none was measured; gain: our mIoU less the
     baseline's, over the same blocks of space, with its 95 % interval.
     """
 
@@ -52,6 +55,8 @@ class Row:
     seconds: float
     core_seconds: float
     reliability: float | None
+    recall: float | None = None
+    precision: float | None = None
     worse: str = ""
     baseline: str | None = None
     baseline_miou: float | None = None
@@ -82,6 +87,7 @@ def measure(
     at_points = replace(cloud, xyz=xyz, instance_ids=cloud.instance_ids[at], rgb=None, certainty=None)
     answer = answered(folder, at_points, truth)
     score = truth.score(answer.called)
+    recall, precision = _of_instances(at_points.instance_ids, truth)
     row = Row(
         scene=folder.name,
         half=half_of(folder.name),
@@ -93,9 +99,23 @@ def measure(
         seconds=seconds,
         core_seconds=worked,
         reliability=cloud.reliability,
+        recall=recall,
+        precision=precision,
         worse=" ".join(f"{kind}={amount}" for kind, amount in changes.items()),
     )
     return _beside_baselines(row, folder, prepared, at, answer, truth, score.classes) if baselines else row
+
+
+def _of_instances(ids: NDArray[np.int32], truth: Truth) -> tuple[float | None, float | None]:
+    """Recall and precision over the points whose truth is known and that a view sees."""
+    if truth.instance is None:
+        return None, None
+    known = (ids > UNOBSERVED) & truth.scored
+    things = np.where(truth.cls >= 0, truth.instance, -1)
+    asked = known & (things >= 0)
+    if truth.background is not None:
+        asked |= known & truth.background
+    return matched_shares(ids[asked], things[asked])
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:

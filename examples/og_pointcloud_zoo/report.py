@@ -33,7 +33,7 @@ def line(row: Row) -> str:
     """One scene on one line."""
     background = "   -  " if row.background is None else f"{100 * row.background:5.2f}%"
     text = f"{row.scene:22} {row.half:6} {row.points:9,} {row.views:4} {row.miou:6.3f} {background} {row.seconds:6.1f}"
-    text += "      -" if row.reliability is None else f" {row.reliability:6.3f}"
+    text += "".join("      -" if of is None else f" {of:6.3f}" for of in (row.recall, row.precision, row.reliability))
     if row.baseline is None or row.gain is None:
         return text
     gain = f"{row.gain:+.3f} ({row.gain_low:+.3f} to {row.gain_high:+.3f})"
@@ -41,7 +41,8 @@ def line(row: Row) -> str:
 
 
 HEADER = (
-    f"{'scene':22} {'half':6} {'points':>9} {'view':>4} {'mIoU':>6} {'called':>6} {'s':>6} {'relia.':>6}  best baseline"
+    f"{'scene':22} {'half':6} {'points':>9} {'view':>4} {'mIoU':>6} {'called':>6} {'s':>6} {'recall':>6} {'precis':>6} "
+    f"{'relia.':>6}  best baseline"
 )
 
 
@@ -67,6 +68,9 @@ def _means(rows: Sequence[Row]) -> str:
         text += f", background called {100 * np.mean(called):.2f} % ({above} of {len(called)} scenes 1 % or more)"
     text += f", {sum(row.seconds for row in rows):.0f} s"
     text += f" ({sum(row.core_seconds for row in rows):.0f} s of cores)"
+    things = [(row.recall, row.precision) for row in rows if row.recall is not None and row.precision is not None]
+    if things:
+        text += "; instances: recall {:.3f}, precision {:.3f}".format(*np.mean(things, axis=0))
     best = [row.baseline_miou for row in rows if row.baseline_miou is not None]
     if best:
         lost = [row.scene for row in rows if row.gain_high is not None and row.gain_high < 0]

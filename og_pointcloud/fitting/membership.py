@@ -20,7 +20,8 @@ probable state (view_reports.py).
 
 Where a proposer misses a cup, its pixels may lie in the mask of its table. The states of the points reveal this: such a
 mask holds most of what its view sees of two groups. It still describes its own group, but from then on votes only for
-"one of the two", and all points are decided once more.
+"one of the two". The states also show which groups are pieces of one thing (fragments.py). Both corrected, all points
+are decided once more.
 
 Torn mask edges leave middling shares on the rim of an object, and views that tear it alike call it background. Rays
 that slip past an edge leave the same on what lies behind. Place and color tell the two apart: a background point with a
