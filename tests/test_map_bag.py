@@ -16,7 +16,7 @@ from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.map_bags import BagFrames
 from og_pointcloud_ros.messages import plain_messages
 from rosbags.rosbag2 import Writer
-from visits import BIN, CHEST, CRATE, SPACE, frames, instance_of
+from visits import BIN, CHEST, CRATE, SPACE, frames, instance_of, moved
 
 import og_pointcloud as og
 from og_pointcloud.cli import main, map_
@@ -64,8 +64,8 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys, monkeypatch):
 
     def interrupted(mapper, frame):
         mappers.append(mapper)
-        if len(mappers) == 7:
-            raise KeyboardInterrupt
+        if len(mappers) == 7:  # what numba makes of Ctrl-C in compiled code
+            raise SystemError("a kernel returned a result with an exception set") from KeyboardInterrupt()
         return integrate(mapper, frame)
 
     given = frames(THINGS)
@@ -81,6 +81,20 @@ def test_an_interrupted_map_is_resumed(tmp_path, capsys, monkeypatch):
     assert "add --resume" in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0
     assert "8 frames" in capsys.readouterr().out
+
+
+def test_a_map_that_goes_on_says_what_changed_and_how_large_it_is(tmp_path, capsys):
+    first, later = tmp_path / "first.ogpc", tmp_path / "later.ogpc"
+    bag = write_bag(tmp_path / "drive", frames(THINGS))
+    assert run(capsys, "map", bag, "-o", first, "--feature-space", SPACE)[0] == 0
+    bag = write_bag(tmp_path / "again", frames([CHEST, moved(CRATE, (-0.9, 0.5, 0.0))], seed=1, first=100.0))
+    code, said, _ = run(capsys, "map", bag, "--start", first, "-o", later)
+    cloud, before = og.load(later).cloud, og.load(first).cloud
+    present = int((cloud.instances.points > 0).sum())
+    assert code == 0
+    assert f"gone: {instance_of(before, BIN)}\nmoved: {instance_of(before, CRATE)} from (" in said
+    assert f"14 frames, {len(cloud):,} points, {present} objects" in said
+    assert present == len(before.instances) - 1
 
 
 @pytest.mark.parametrize("more", [[], ["--resume"]])

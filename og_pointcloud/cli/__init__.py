@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import LONGEST_CELL, Parser, add_command, check_outputs
+from og_pointcloud.cli.common import LONGEST_CELL, Parser, add_command, check_outputs, interruptible
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_mean, missing_extra, printable
 
 __all__ = ["main"]
@@ -49,7 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if unknown:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
         check_outputs(arguments)
-        with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout or io.StringIO())):  # pyright: ignore
+        plain: Any = Plain(sys.stdout or io.StringIO())
+        with warnings.catch_warnings(), redirect_stdout(plain), interruptible():
             warnings.simplefilter("ignore")  # warnings of libraries to programmers
             warnings.simplefilter("always", UserWarning)  # warnings of this library to users
             warnings.showwarning = print_warning

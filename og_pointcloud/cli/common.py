@@ -12,7 +12,8 @@ import re
 import shlex
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from textwrap import indent
@@ -256,6 +257,20 @@ def likely_words(cloud: LabelledCloud) -> list[str]:
     largest = LabelledScene.from_cloud(cloud).instances.largest()
     best = dict.fromkeys(row.words[0][0] for row in largest if row.points and row.words)
     return list(best)[:2] or list(cloud.vocabulary.names[:2] if cloud.vocabulary else ())
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C raises KeyboardInterrupt even in compiled code, where numba makes a chain of SystemErrors of it."""
+    try:
+        yield
+    except SystemError as error:
+        cause: BaseException | None = error
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
+        raise
 
 
 def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:

@@ -83,7 +83,8 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
     capture = arguments.capture[0]
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
     try:
-        cloud = fit_capture(capture, options, work=work, executor=executor, progress=True)
+        with common.interruptible():
+            cloud = fit_capture(capture, options, work=work, executor=executor, progress=True)
     except KeyboardInterrupt:
         if views := kept_files(work, "view"):
             print(f"kept in '{work}': {counted(views, 'view')}; the same command continues after them", file=sys.stderr)

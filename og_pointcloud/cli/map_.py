@@ -13,7 +13,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import SHOWN, Parser, add_option, add_output, add_shared, print_next, replaceable
+from og_pointcloud.cli.common import (
+    SHOWN,
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    interruptible,
+    print_next,
+    replaceable,
+)
+from og_pointcloud.cli.update import print_changes
 from og_pointcloud.errors import OgPointcloudError, counted
 
 if TYPE_CHECKING:
@@ -40,13 +50,17 @@ def run(arguments: argparse.Namespace) -> None:
     if work.exists() and not arguments.resume:
         raise OgPointcloudError(f"'{work}' contains an interrupted map: add --resume, or remove it")
     try:
-        mapper, taken = saved_map(arguments, work)
+        with interruptible():
+            mapper, taken = saved_map(arguments, work)
     except KeyboardInterrupt:
         if work.exists():
             print(f"kept in '{work}': the map so far; --resume continues it", file=sys.stderr)
         raise
     shutil.rmtree(work)
-    made = (taken, "frame"), (mapper.points, "point"), (len(mapper.objects()), "object")
+    if mapper.changes is not None:
+        print_changes(mapper.changes)
+    cloud = mapper.snapshot().cloud
+    made = (taken, "frame"), (len(cloud), "point"), (int((cloud.instances.points > 0).sum()), "object")
     print(", ".join(counted(count, thing) for count, thing in made))
     print(f"wrote {arguments.output}")
     print_next("info", arguments.output)
