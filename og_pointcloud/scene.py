@@ -63,9 +63,11 @@ def _brief(value: Any) -> str:
 
 
 def take_arrays(record: Any, *names: str) -> None:
-    """Convert lists in these fields of a frozen record to arrays; SceneError for ragged ones."""
+    """Convert lists and torch tensors in these fields of a frozen record to arrays; SceneError for ragged lists."""
     for name in names:
         value = getattr(record, name)
+        if _is_of_torch(value):
+            object.__setattr__(record, name, numbers_of(value).copy())
         if isinstance(value, list | tuple):
             try:
                 object.__setattr__(record, name, np.asarray(value))
@@ -76,11 +78,14 @@ def take_arrays(record: Any, *names: str) -> None:
 def numbers_of(value: Any) -> NDArray[Any]:
     """np.asarray that also takes torch tensors; for a value that it cannot convert, such as rows of different lengths,
     a scalar None, which matches no expected shape."""
-    of_torch = any(kind.__module__.partition(".")[0] == "torch" for kind in type(value).__mro__)
     try:
-        return np.asarray(dense_tensor(value) if of_torch else value)
+        return np.asarray(dense_tensor(value) if _is_of_torch(value) else value)
     except Exception:  # arrays of GPU libraries raise types of their own
         return np.array(None)
+
+
+def _is_of_torch(value: Any) -> bool:
+    return any(kind.__module__.partition(".")[0] == "torch" for kind in type(value).__mro__)
 
 
 def dense_tensor(tensor: Any) -> NDArray[Any] | None:
@@ -220,8 +225,10 @@ class View:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise SceneError(f"a view's name is {self.name!r:.80}; expected text, such as its image's file stem")
+        if not isinstance(self.camera, Camera):
+            raise SceneError(f"view '{self.name}': the camera is a {type(self.camera).__name__}; expected an og.Camera")
         take_arrays(self, "image", "mask_features", "mask_tracks")
-        features = self.mask_features
+        features = np.asarray(self.mask_features)
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
                 f"view '{self.name}': mask features are {features.dtype} {features.shape}; expected float32 (masks, "
@@ -482,6 +489,13 @@ class Scene:
         object.__setattr__(self, "views", tuple(self.views or ()))
         if not self.views:
             raise SceneError("the scene has 0 views; expected at least one posed image with a mask")
+        parts: list[tuple[Any, type]] = [(self.points, Points), *((view, View) for view in self.views)]
+        for value, kind in [*parts, (self.feature_space, str)]:
+            if not isinstance(value, kind):
+                raise SceneError(
+                    f"a scene is given {value!r:.60}; expected {kind.__name__}: Scene(points, views, feature_space) "
+                    "takes what Points.from_world(xyz) gives, views, and the name of the features' encoder"
+                )
         if not len(self.points):
             raise SceneError("the scene has 0 points; expected at least one: check the geometry")
         widths = {view.mask_features.shape[1]: view.name for view in self.views if view.mask_count}

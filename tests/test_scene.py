@@ -150,6 +150,20 @@ def test_views_without_a_name_and_scenes_without_a_point_are_refused():
         _view(name=3)
     with pytest.raises(SceneError, match="the scene has 0 points; expected at least one"):
         Scene(Points(np.zeros((0, 3), np.float32), np.zeros(3)), (_view(),), "letters")
+    with pytest.raises(SceneError, match=r"view 'a': the camera is a ndarray; expected an og\.Camera"):
+        _view(camera=np.eye(4))
+    with pytest.raises(SceneError, match=r"view 'a': mask features are object \(\); expected float32"):
+        _view(mask_features=None)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "kind"), [(0, np.zeros((5, 3)), "Points"), (1, ["a.png"], "View"), (2, None, "str")]
+)
+def test_scenes_of_other_things_are_refused(place: int, value: Any, kind: str):
+    parts: list[Any] = [Points(np.zeros((1, 3), np.float32), np.zeros(3)), (_view(),), "letters"]
+    parts[place] = value
+    with pytest.raises(SceneError, match=f"a scene is given .*; expected {kind}: Scene"):
+        Scene(*parts)
 
 
 @pytest.mark.parametrize(
@@ -178,6 +192,20 @@ def test_views_may_come_from_a_generator():
         Scene(scene.points, views[:1] * 2, "letters")  # type: ignore[arg-type]
     with pytest.raises(SceneError, match="the scene has 0 views"):
         Scene(scene.points, iter(()), "letters")  # type: ignore[arg-type]
+
+
+def test_tensors_are_taken_as_arrays_are():
+    torch = pytest.importorskip("torch")
+    xyz, rgb, features = np.ones((2, 3)), np.full((2, 3), 7, np.uint8), np.eye(2, 4, dtype=np.float32)
+    points = Points.from_world(torch.from_numpy(xyz), rgb=torch.from_numpy(rgb))
+    assert points.xyz_world.tolist() == xyz.tolist()
+    view = _view(mask_features=torch.from_numpy(features), mask_tracks=torch.arange(2))
+    rgb[:], features[:] = 0, 0  # copied
+    assert points.rgb is not None
+    assert (points.rgb == 7).all()
+    assert view.mask_features.tolist() == np.eye(2, 4).tolist()
+    with pytest.raises(SceneError, match="mask features are float64"):
+        _view(mask_features=torch.zeros(2, 4, dtype=torch.float64))
 
 
 def test_evenly_takes_first_and_last():
