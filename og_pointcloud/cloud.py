@@ -116,6 +116,10 @@ class InstanceTable:
         for each in fields(self):
             kind = np.float32 if each.name in _FLOAT_COLUMNS else np.int32
             object.__setattr__(self, each.name, _as_stored(getattr(self, each.name), kind, f"instance {each.name}"))
+        for name, (least, most) in _RANGES.items():
+            values = getattr(self, name)
+            if len(wrong := values[(values < least) | (values > most)]):  # NaN is "not known"
+                raise OgPointcloudError(f"instance {name} is {wrong[0]}; expected {least:g} to {most:g}")
         owner = self.descriptor_instance  # ascending, so that each instance's descriptors are one slice
         if owner.size and (owner.min() < 0 or owner.max() >= count or (np.diff(owner) < 0).any()):
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
@@ -149,6 +153,11 @@ class InstanceTable:
 
 
 _FLOAT_COLUMNS = ("descriptors", "agreement", "visible_area", "reliability")
+_RANGES = {
+    **dict.fromkeys(("points", "views", "masks", "visible_area"), (0, np.inf)),
+    "agreement": (-1.001, 1.001), "reliability": (0, 1.001),
+}  # fmt: skip
+"""What columns of an instance table can hold; shares and cosines leave room for rounding."""
 
 
 def _as_stored(values: NDArray[Any], kind: type[np.number], what: str) -> NDArray[Any]:

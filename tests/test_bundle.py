@@ -326,6 +326,12 @@ def say(*keys_and_value):
         (put("arrays/instance_ids.npy", npy_bytes(np.zeros(500, "<i8")).replace(b"'<i8'", b"'|O' ")), "Python objects"),
         (put("arrays/instance_ids.npy", npy_bytes(np.full(500, 9, np.int8))), "instance ids span 9..9"),
         (put("arrays/instance_ids.npy", npy_bytes(np.full(500, -3, np.int8))), "instance ids span -3..-3"),
+        *(
+            (put(f"arrays/instances/{name}.npy", npy_bytes(np.array([5] * 8 + [value], kind))), f"{name} is {value}")
+            for name, kind, value in (("views", "<i4", -1), ("masks", "<i4", -2), ("visible_area", "<f4", -1.0))
+        ),
+        (put("arrays/instances/agreement.npy", npy_bytes(np.full(9, 5, np.float32))), "agreement is 5.0; expected -1"),
+        (put("arrays/instances/reliability.npy", npy_bytes(np.full(9, -0.5, np.float32))), "is -0.5; expected 0 to 1"),
         (put("arrays/certainty.npy", npy_bytes(np.zeros(500, np.float32))), r"is <f4 \(500,\); expected \|u1"),
         (put("arrays/certainty.npy", npy_bytes(np.zeros(499, np.uint8))), r"expected \|u1 \(500,\)"),
         (put("vocabulary/names.json", b'["a", "a", "b", "c", "d"]'), "not a list of 5 different words"),
