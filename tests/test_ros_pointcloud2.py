@@ -18,7 +18,8 @@ from og_pointcloud_ros import (
     to_pointcloud2,
     write_fields,
 )
-from og_pointcloud_ros.messages import nanoseconds
+from og_pointcloud_ros.labelling import CloudLabeller
+from og_pointcloud_ros.messages import nanoseconds, plain_messages
 
 import og_pointcloud as og
 from og_pointcloud.formats.colors import label_colors
@@ -163,6 +164,19 @@ def test_what_is_no_cloud():
 @pytest.fixture(scope="module")
 def result(scene):
     return og.segment(np.concatenate([scene.xyz[:200], [[9, 9, 9], [np.nan, 0, 0]]]), ["apple", "pear", "plum"], scene)
+
+
+def test_an_organized_cloud_stays_organized(scene):
+    rows = np.zeros((3, 4), [(axis, "<f4") for axis in "zyx"])
+    for axis, values in zip("xyz", scene.xyz[:12].T, strict=True):
+        rows[axis] = values.reshape(3, 4)
+    segmenter = og.Segmenter(scene, ["apple", "pear", "plum"])
+    cloud = CloudLabeller(segmenter, plain_messages)(write_fields(rows, "map"), np.eye(4)).points
+    assert (cloud.height, cloud.width, cloud.row_step) == (3, 4, 4 * 28)
+    np.testing.assert_array_equal(read_fields(cloud)["x"], rows["x"])
+    np.testing.assert_array_equal(read_fields(cloud)["instance"].ravel(), segmenter(scene.xyz[:12]).instances)
+    with pytest.raises(og.SceneError, match=r"xyz has shape \(4, 4\); expected \(12, 3\), one row per label, or \("):
+        to_pointcloud2(segmenter(scene.xyz[:12]), xyz=np.zeros((4, 4)))
 
 
 def test_a_labelled_cloud_says_what_the_result_says(result):

@@ -1,8 +1,8 @@
 """Messages of one stamp -> a frame of a map: depth and color images, masks with features, the camera.
 
-Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 16UC1 or 32SC1: 0 none, else a number from 1 on
-that is valid in this image only. A PointCloud2 with a field ``feature`` has one row per mask, the encoder's features of
-masks 1, 2, ... CameraInfo has pixel centers at integer coordinates.
+Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 8UC1, 16UC1 or 32SC1: 0 none, else a number from
+1 on that is valid in this image only. A PointCloud2 with a field ``feature`` has one row per mask, the encoder's
+features of masks 1, 2, ... CameraInfo has pixel centers at integer coordinates.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ from og_pointcloud_ros.pointcloud2 import read_fields
 
 REQUIRED_ROLES = ("depth", "masks", "features")
 """Roles of messages that a frame waits for."""
-ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8": "u1", "bgr8": "u1", "mono8": "u1"}
+ENCODINGS = {
+    "8UC1": ("u1", 1), "mono8": ("u1", 1), "16UC1": ("u2", 1), "mono16": ("u2", 1), "32SC1": ("i4", 1),
+    "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4),
+}  # fmt: skip
+"""Encoding of an image -> type and number of its channels."""
 
 
 def image_array(message: Any) -> NDArray[Any]:
@@ -33,9 +37,9 @@ def image_array(message: Any) -> NDArray[Any]:
     encoding = str(message.encoding)
     if encoding not in ENCODINGS:
         raise SceneError(f"image encoding is '{encoding}'; expected one of {', '.join(ENCODINGS)}")
-    kind = np.dtype(ENCODINGS[encoding]).newbyteorder(">" if message.is_bigendian else "<")
+    code, channels = ENCODINGS[encoding]
+    kind = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
     data = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8)
-    channels = 3 if encoding in ("rgb8", "bgr8") else 1
     # A line may be longer than its pixels: step includes padding.
     line = message.width * channels * kind.itemsize
     if message.step < line or len(data) < message.step * message.height:
@@ -43,7 +47,7 @@ def image_array(message: Any) -> NDArray[Any]:
     lines = data[: message.step * message.height].reshape(message.height, message.step)[:, :line]
     pixels = np.ascontiguousarray(lines).view(kind).reshape(message.height, message.width, channels)
     pixels = pixels.astype(kind.newbyteorder("="))
-    return pixels[..., ::-1] if encoding == "bgr8" else pixels if channels == 3 else pixels[..., 0]
+    return pixels[..., 0] if channels == 1 else pixels[..., 2::-1] if encoding[0] == "b" else pixels[..., :3]
 
 
 @dataclass

@@ -44,16 +44,18 @@ class CloudLabeller:
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), from there to the scene's frame.
 
-        The labelled cloud keeps the frame, stamp and coordinates of the message, so that tools that match the two by
-        time, or display them with tf, see them in the same place.
+        The labelled cloud keeps the frame, stamp, height, width and coordinates of the message, so that tools that
+        match the two by time, or display them with tf, see them in the same place.
         """
         xyz = from_pointcloud2(message)
         result = self.segmenter(xyz, pose)
         head = message.header
         # Coordinates stay float64 if they were: those of a map may lie far from 0.
-        kind = read_fields(message).dtype
-        double = any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
-        points = to_pointcloud2(result, head.frame_id, head.stamp, xyz=xyz, double=double, messages=self._messages)
+        rows = read_fields(message)
+        double = any(rows.dtype[axis].itemsize > 4 for axis in "xyz" if axis in (rows.dtype.names or ()))
+        points = to_pointcloud2(
+            result, head.frame_id, head.stamp, xyz=xyz.reshape(*rows.shape, 3), double=double, messages=self._messages
+        )
         detections = to_detections(
             self._instances, result, self._frame, head.stamp, minimum_points=self._minimum_points,
             messages=self._messages,

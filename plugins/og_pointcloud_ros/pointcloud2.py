@@ -96,13 +96,18 @@ def to_pointcloud2(
     label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` gives the names). instance: int32, -1
     background, -2 unobserved, -3 too far. score: float32. rgb: one color per label, packed as in PCL.
     stamp: a Time message, or nanoseconds since the epoch. messages: factory of the message's library.
-    xyz: (N, 3) coordinates in frame_id, if that is not the scene's world: the sensor's cloud.
+    xyz: (N, 3) coordinates in frame_id, if that is not the scene's world: the sensor's cloud; (height, width, 3) for a
+    message of that height and width.
     double: write x y z as float64, which few viewers read; None: if float32 would round most of them by millimeters,
     as for a map in UTM. ROS units are meters (REP 103).
     """
     xyz = result.xyz if xyz is None else xyz
-    if xyz.shape != (len(result), 3):
-        raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), one row per label")
+    organized = xyz.shape[:-1]
+    if len(organized) not in (1, 2) or xyz.shape[-1] != 3 or xyz.size != 3 * len(result):
+        raise SceneError(
+            f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), one row per label, or (height, width, 3)"
+        )
+    xyz = xyz.reshape(-1, 3)
     if double is None and xyz.dtype != np.float32:
         finite = np.abs(xyz[np.logical_and.reduce(np.isfinite(xyz), axis=1)])
         double = bool(len(finite)) and float(np.median(finite.max(axis=1))) > MAX_FLOAT32_M
@@ -116,7 +121,8 @@ def to_pointcloud2(
     rows["label"] = np.where(result.labels < 0, UNLABELLED, result.labels)
     rows["instance"] = result.instances
     rows["score"] = result.scores
-    return write_fields(rows.view([*((axis, place) for axis in "xyz"), *colors]), frame_id, stamp, messages=messages)
+    rows = rows.view([*((axis, place) for axis in "xyz"), *colors]).reshape(organized)
+    return write_fields(rows, frame_id, stamp, messages=messages)
 
 
 def write_fields(
