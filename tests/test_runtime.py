@@ -750,8 +750,10 @@ def test_a_shorter_reach_is_exact(scene):
         assert ((result.instances == TOO_FAR) == (true > limit)).all()
         assert (result.instances == scene.instances_at(points))[true <= limit].all()
     for limit in (0, -1, 0.16, float("nan"), "0.1", [0.1]):
-        with pytest.raises(OgPointcloudError, match=r"max_distance is .*reach, 0.15"):
+        with pytest.raises(OgPointcloudError, match=rf"max_distance is {re.escape(repr(limit))}; .*reach, 0.15"):
             og.segment(points, words, scene, max_distance=limit)
+    with pytest.warns(UserWarning, match="too far from the scene; .* and max_distance is 0.001: bring"):
+        og.segment(scene.xyz + 0.002, words, scene, max_distance=0.001)
 
 
 @pytest.mark.parametrize("name", ["room", "far outliers", "coincident points of different ids", "scattered points"])

@@ -164,8 +164,8 @@ class LabelledScene:
         """OgPointcloudError unless the distance is a length above 0, and at most the scene's reach."""
         if max_distance is not None and not (isinstance(max_distance, Real) and 0 < max_distance <= self.cloud.reach):
             raise OgPointcloudError(
-                f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
-                "points farther than that have no label"
+                f"max_distance is {max_distance!r:.40}; expected a length up to the scene's reach, "
+                f"{self.cloud.reach:.4g}: points farther than that have no label"
             )
 
     def certainty_at(self, points: NDArray[np.floating]) -> FloatArray | None:
@@ -335,7 +335,7 @@ class Segmenter:
             certainty_of,
         )  # fmt: skip
         is_empty = len(result) == 0
-        if is_empty not in self._warned and (reason := _label_warning(result, scene, are_own, pose)):
+        if is_empty not in self._warned and (reason := _label_warning(result, self, are_own, pose)):
             self._warned.add(is_empty)
             warnings.warn(reason, stacklevel=3)  # at the call of segment, or of the segmenter
         return result
@@ -421,13 +421,13 @@ def _posed(points: DoubleArray, pose: ArrayLike | None) -> DoubleArray:
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _label_warning(result: Segmentation, scene: LabelledScene, are_own: bool, pose: ArrayLike | None) -> str | None:
+def _label_warning(result: Segmentation, ask: Segmenter, are_own: bool, pose: ArrayLike | None) -> str | None:
     """Why no point has a label, or why labels may be wrong because points are misplaced; None if all is well. are_own:
     whether they are the scene's own points."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
     far = int((result.reasons == Reason.TOO_FAR).sum())
-    cause = "" if are_own else _misplacement(result.xyz[result.reasons != Reason.NOT_FINITE], far, scene, pose)
+    cause = "" if are_own else _misplacement(result.xyz[result.reasons != Reason.NOT_FINITE], far, ask, pose)
     if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {cause}' if cause else ''}"
@@ -435,9 +435,10 @@ def _label_warning(result: Segmentation, scene: LabelledScene, are_own: bool, po
     return cause and f"{others if far else 'labels may be wrong'}; {cause}"
 
 
-def _misplacement(points: DoubleArray, far: int, scene: LabelledScene, pose: ArrayLike | None) -> str:
+def _misplacement(points: DoubleArray, far: int, ask: Segmenter, pose: ArrayLike | None) -> str:
     """Why finite points may be misplaced relative to the scene: precision, frame or unit; "" if nothing suggests it.
     far: how many are too far from it. pose: the pose that was applied to them."""
+    scene, max_distance = ask.scene, ask._max_distance
     if len(scene.cloud) == 0:
         return ""
     sample = points[:: 1 + len(points) // SAMPLE_POINTS]
@@ -450,9 +451,10 @@ def _misplacement(points: DoubleArray, far: int, scene: LabelledScene, pose: Arr
     if pose is not None and (coarse := rounded_pose(pose, spacing)):
         return coarse
     if far > MISPLACED_SHARE * len(points):
+        limit = f"its reach is {reach:.4g}" if max_distance is None else f"max_distance is {max_distance:.4g}"
         return (
-            f"the points span {span(points)}, the scene {span(scene.xyz)}, and its reach is {reach:.4g}: bring them "
-            "into the scene's frame and unit"
+            f"the points span {span(points)}, the scene {span(scene.xyz)}, and {limit}: bring them into the scene's "
+            "frame and unit"
         )
     if enough and (width := _width(sample)) < reach < _width(scene.cloud.xyz) / WIDE_SCENE_REACHES:
         return (
