@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sqlite3
 import sys
@@ -483,8 +484,9 @@ def test_commands(folder, capsys, tmp_path):
     (folder / "broken.ogpc").write_bytes(b"x")
     atlas, page = str(tmp_path / "atlas"), tmp_path / "found.html"
     code, out, err = run(capsys, "index", folder, "-o", atlas)
-    assert (code, "2 added" in out) == (0, True)
-    assert "2 scenes with 3 instances" in out
+    assert code == 0
+    assert f"2 added, 1 left out, 0 unchanged: 2 scenes with 3 instances in {atlas}" in out
+    assert re.fullmatch(rf"Collection\('{re.escape(atlas)}': 2 scenes, \d+ words\)", repr(og.Collection(atlas)))
     assert out.splitlines()[-1].split()[-1] in ("chair", "mug"), "not 'bed', the first of all words"
     assert "broken is left out" in err
     (folder / "one").mkdir()

@@ -105,6 +105,9 @@ class Collection:
         self._stamp: tuple[int, ...] = ()
         self._open()
 
+    def __repr__(self) -> str:
+        return f"Collection('{self.path}': {counted(len(self.entries), 'scene')}, {counted(len(self.words), 'word')})"
+
     def _open(self) -> None:
         """Read the list of scenes, if the atlas has changed since it was last read."""
         state = self.path.stat() if self.path.is_file() else None

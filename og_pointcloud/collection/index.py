@@ -48,8 +48,8 @@ class Changes:
     unchanged: int
 
     def __str__(self) -> str:
-        counts = [("added", self.added), ("replaced", self.replaced), ("removed", self.removed)]
-        parts = [f"{len(names)} {what}" for what, names in counts if names]
+        counts = {"added": self.added, "replaced": self.replaced, "removed": self.removed, "left out": self.left_out}
+        parts = [f"{len(names)} {what}" for what, names in counts.items() if names]
         return ", ".join([*parts, f"{self.unchanged} unchanged"])
 
 
