@@ -242,7 +242,7 @@ def test_a_folder_by_image_name(tmp_path):
     assert len(folder.of("rgb/c", (60, 80))) == 1
     assert len(folder.of("left/rgb/c", (60, 80))) == 1
     for another in ("e", "left/c", "left/d"):  # the path in the file names another camera, or none
-        with pytest.raises(SceneError, match=f"no masks for image '{another}'"):
+        with pytest.raises(SceneError, match=f"no masks for image '{another}'; expected {another}.png"):
             folder.of(another, (4, 5))
 
 

@@ -167,8 +167,8 @@ class ExistingMasks:
                 "expected one: use the paths of the pose file in the COCO file"
             )
         raise SceneError(
-            f"{self.folder} has no masks for image '{image_name}'; expected {png.name}, {single.name}, or a COCO .json "
-            "that lists it"
+            f"{self.folder} has no masks for image '{image_name}'; expected {image_name}.png or {image_name}.json in "
+            "it, or a COCO .json that lists it"
         )
 
     @cached_property
