@@ -437,6 +437,13 @@ def test_another_place_is_refused(monday, friday):
     assert (len(said), said[0].filename) == (1, __file__)
 
 
+def test_a_visit_that_seems_to_move_most_things_is_doubted(monday):
+    aside = replace(monday, origin=monday.origin + np.array([0.4, 0.0, 0.0]))
+    with pytest.warns(UserWarning, match="3 of the 4 things .* not in the same world frame: register") as said:
+        assert len(og.compare(monday, aside).moved) == 3
+    assert (len(said), said[0].filename) == (1, __file__)
+
+
 def test_another_encoder_is_refused(monday):
     other = replace(scene(AFTER), feature_space="another-space")
     with pytest.raises(FeatureSpaceError, match=f"expected feature space '{SPACE}'"):

@@ -52,6 +52,8 @@ MIN_STILL_SHARE = 0.05
 """Share of all points looked at, including hidden ones, that must be where they were; else the frames differ."""
 SMALL_PIECE_SHARE = 0.5
 """A piece is small if it has less than this share of the other's points."""
+MANY_THINGS, MAX_CHANGED_SHARE = 4, 0.5
+"""If more than this share of so many things left or moved, a warning asks whether the frames differ."""
 MAX_THROUGH_SHARE = 0.5
 """If more than this share of the points measured again or seen through is seen through, the frames differ."""
 
@@ -164,7 +166,20 @@ def compare_visits(
     not_there = was_there.missing(distance > spacing)
     of_later = Evidence(shows, was_there.present, was_there.absent, later.distinct(tolerance), not_there)
     nearest = np.where(distance <= SAME_SURFACE_SPACINGS * a.spacing, nearest, -1)
-    return _decide(earlier, later, of_earlier, of_later, nearest)
+    found = _decide(earlier, later, of_earlier, of_later, nearest)
+    _warn_of_many_changes(found.changes, int(np.count_nonzero(earlier.count(a.instance_ids >= 0))))
+    return found
+
+
+def _warn_of_many_changes(changes: Changes, things: int) -> None:
+    """A warning where most things changed: in a room, walls agree with themselves even half a meter off."""
+    changed, seen = len(changes.gone) + len(changes.moved), things - len(changes.unseen)
+    if seen >= MANY_THINGS and changed > MAX_CHANGED_SHARE * seen:
+        warnings.warn(
+            f"{changed} of the {seen} things that the later visit looks at have left or moved: if they have not, the "
+            "two are not in the same world frame: register their poses first",
+            stacklevel=4,
+        )
 
 
 def _require_one_frame(now: Presence) -> None:
