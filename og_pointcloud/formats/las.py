@@ -116,7 +116,7 @@ def write_las(
 
 
 def _is_las(path: StrPath) -> bool:
-    with open(path, "rb") as file:
+    with naming(Path(path)), open(path, "rb") as file:
         return file.read(len(SIGNATURE)) == SIGNATURE
 
 
