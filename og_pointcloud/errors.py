@@ -119,15 +119,19 @@ class FeatureSpaceError(OgPointcloudError):
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is absent; the message names the extra that brings it.
+    """An optional dependency is absent, or cannot be loaded; the message names the extra that brings it, or the cause.
 
     >>> import og_pointcloud as og
     >>> str(og.MissingExtraError("laspy", "las"))
     "this needs laspy, which is not installed: pip install 'og-pointcloud[las]'"
     """
 
-    def __init__(self, module: str, extra: str) -> None:
-        super().__init__(f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'")
+    def __init__(self, module: str, extra: str, cause: ImportError | None = None) -> None:
+        wrong = "is not installed"
+        if cause is not None and not isinstance(cause, (ModuleNotFoundError, MissingExtraError)):
+            # It may lack a system library, or memory: then installing it does not help.
+            wrong = f"cannot be loaded ({first_line(cause)}); remove the cause, or else"
+        super().__init__(f"this needs {module}, which {wrong}: pip install 'og-pointcloud[{extra}]'")
 
 
 NEEDED_FOR_FITS = ("numba", "scipy", "cv2", "PIL", "tqdm", "onnx")
@@ -146,4 +150,4 @@ def naming_extra(module: str, extra: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise MissingExtraError(module, extra) from error
+        raise MissingExtraError(module, extra, error) from error

@@ -96,6 +96,21 @@ for ask in (
     ]
 
 
+def test_a_module_that_cannot_be_loaded_is_not_said_to_be_absent(tmp_path):
+    (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
+    code = """import sys
+sys.path.insert(0, sys.argv[1])
+import og_pointcloud as og
+from og_pointcloud.formats.images import require_cv2
+try:
+    require_cv2()
+except og.MissingExtraError as error:
+    print(error)
+"""
+    told = run(code, tmp_path)
+    assert "which cannot be loaded (libGL.so.1: cannot open shared object file); remove the cause, or else: pip" in told
+
+
 @pytest.mark.parametrize("module", ["scipy", "numba"])
 def test_what_makes_scenes_names_its_extra(module):
     code = f"""import sys

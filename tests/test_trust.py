@@ -412,6 +412,21 @@ def test_a_disk_that_is_full_while_a_command_writes(bundle, tmp_path, capsys, mo
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_full_disk_does_not_end_a_lock(tmp_path):
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        with (
+            locked(tmp_path / "work"),
+            pytest.raises(OgPointcloudError, match="in use by another process"),
+            locked(tmp_path / "work"),
+        ):
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 def test_a_folder_is_whole_or_not_there(tmp_path):
     (tmp_path / ".bag.1.tmp").mkdir()
     (tmp_path / ".bag.1.tmp" / "half").write_text("x")

@@ -137,11 +137,11 @@ def locked(folder: Path) -> Iterator[None]:
         file.close()
 
 
-def _lock_file(folder: Path) -> IO[str]:
+def _lock_file(folder: Path) -> IO[bytes]:
     while True:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            file = (folder / LOCK).open("a+")
+            file = (folder / LOCK).open("ab+", buffering=0)
         except OSError as error:
             raise OgPointcloudError(
                 f"the work folder '{folder}' cannot be used ({error.strerror}); expected a writable folder: name "
@@ -149,7 +149,7 @@ def _lock_file(folder: Path) -> IO[str]:
             ) from error
         if not _hold(file):
             file.seek(0)
-            holder = file.read(80).strip() or "another process"
+            holder = file.read(80).decode(errors="replace").strip() or "another process"
             file.close()
             raise OgPointcloudError(
                 f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
@@ -159,14 +159,14 @@ def _lock_file(folder: Path) -> IO[str]:
         # nobody out, and the next iteration creates a new one.
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), (folder / LOCK).stat()):
-                file.truncate(0)
-                file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}")
-                file.flush()
+                with suppress(OSError):  # a full disk: the lock holds without its owner's name
+                    file.truncate(0)
+                    file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}".encode())
                 return file
         file.close()
 
 
-def _hold(file: IO[str] | IO[bytes]) -> bool:
+def _hold(file: IO[bytes]) -> bool:
     """Lock an open file until it is closed; False where another process has locked it."""
     if fcntl is not None:
         try:
