@@ -315,3 +315,14 @@ def test_rigs_as_colmap_writes_them(tmp_path):
         for image in poses.images:
             np.testing.assert_allclose(image.camera.world_to_camera, expected[image.path], atol=1e-9)
             assert image.camera.fx == (70.0 if image.path.startswith("left") else 60.0)
+
+
+def test_depth_is_asked_for_by_the_name_of_a_face(tmp_path):
+    """A panorama's own depth image, which holds lengths of rays, is not read: that of a face has to be named."""
+    write_panoramas(tmp_path)
+    first = read_poses(tmp_path).names[0]
+    image, face = first.split("/")
+    assert face == "front"
+    write_image(tmp_path / "depth" / f"{image}.png", np.ones(SIZE[::-1], np.uint16))
+    with pytest.raises(SceneError, match=f"has no depth images; expected depth/{first}.png and so on"):
+        capture.fuse_capture(tmp_path)

@@ -376,9 +376,11 @@ def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCl
     depth_unit: world lengths per stored step, if the files do not state it. Raises SceneError without depth images.
     """
     capture = Path(folder)
-    frames = _depth_frames(capture, read_poses(capture))
+    poses = read_poses(capture)
+    frames = _depth_frames(capture, poses)
     if not frames:
-        raise SceneError(f"{capture} has no depth images; expected depth/<image stem>.png, or depth_file_path in poses")
+        first = f"depth/{poses.names[0]}.png"  # of a panorama's face: its depth is of a pinhole
+        raise SceneError(f"{capture} has no depth images; expected {first} and so on, or depth_file_path in poses")
     if depth_unit is not None:
         frames = [replace(frame, depth=replace(frame.depth, unit=depth_unit, integer_unit=None)) for frame in frames]
     return _fused(capture, frames)
