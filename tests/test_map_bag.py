@@ -128,6 +128,15 @@ def test_where_no_frame_is_taken_it_is_said_why_and_nothing_is_left(tmp_path, ca
     assert sorted(path.name for path in tmp_path.iterdir()) == ["drive"]
 
 
+def test_a_map_without_masks_leaves_nothing_either(tmp_path, capsys):
+    bag = write_bag(tmp_path / "drive", frames(THINGS)[:2], messages=shifted)
+    code, _, said = run(capsys, "map", bag, "-o", tmp_path / "room.ogpc")
+    assert code == 2
+    assert "left out: 2 x masks came without features" in said
+    assert "no frame with masks has shown any point of the map yet" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drive"]
+
+
 def as_gray(make, frame):
     messages = messages_of(make, frame)
     return messages | {"color": image_message(make, frame.rgb[..., 0], "mono8", stamp_of(frame))}
@@ -178,12 +187,13 @@ def test_images_of_other_encodings_are_read_alike(tmp_path, colors, masks):
     np.testing.assert_array_equal(read.masks, frame.masks)
 
 
-def test_masks_and_features_of_different_stamps_are_counted(tmp_path):
-    def shifted(make, frame):
-        messages = messages_of(make, frame)
-        messages["masks"].header.stamp.nanosec += 1
-        return messages
+def shifted(make, frame):
+    messages = messages_of(make, frame)
+    messages["masks"].header.stamp.nanosec += 1
+    return messages
 
+
+def test_masks_and_features_of_different_stamps_are_counted(tmp_path):
     bag = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:3], messages=shifted))
     assert [frame.features for frame in bag] == [None] * 3
     assert bag.dropped == {

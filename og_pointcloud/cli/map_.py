@@ -24,7 +24,7 @@ from og_pointcloud.cli.common import (
     replaceable,
 )
 from og_pointcloud.cli.update import print_changes
-from og_pointcloud.errors import OgPointcloudError, counted
+from og_pointcloud.errors import OgPointcloudError, SceneError, counted
 
 if TYPE_CHECKING:
     from og_pointcloud.mapping.mapper import Mapper
@@ -86,8 +86,12 @@ def saved_map(arguments: argparse.Namespace, work: Path) -> tuple[Mapper, int]:
                 refused[str(error).replace(f"frame {frame.stamp or 0:.15g}", "a frame")].append(str(error))
         reasons = {said[0] if len(said) == 1 else why: len(said) for why, said in refused.items()}
         print_left_out([*frames.dropped.items(), *reasons.items()])
-        if not taken and not arguments.resume:  # nothing to save (the next line's error says so) or resume
-            shutil.rmtree(work)
+        try:
+            mapper.snapshot()
+        except SceneError:  # nothing to save, nor to resume
+            if not arguments.resume:
+                shutil.rmtree(work)
+            raise
         mapper.save(arguments.output)
     return mapper, taken
 
