@@ -204,6 +204,7 @@ def test_box_and_scenes_restrict(folder):
     ("words", [5, None, [], ["mug", " "], [["mug"]], {}], "expected at least one word or phrase"),
     ("scenes", [5, [], [None], "", [["site0"]]], "expected at least one name or pattern, or None for all"),
     ("scenes", ["room9"], "no scene is called 'room9'"),
+    ("scenes", ["Site0/room00"], r"or a pattern; did you mean 'site0/room00'[^;]*\?$"),
     ("top", [0, 2.5, "3", None], "top is .*; expected a whole number, at least 1"),
     ("within", [5, [[0, 0, 0], [1, 1]], (["a"] * 3, ["b"] * 3), ([1j] * 3, [2j] * 3), ([0, 0, 0], [0, -1, 0]),
                 ([np.nan] * 3, [1] * 3)], "expected two corners of three numbers, the low one first"),

@@ -224,8 +224,8 @@ class Collection:
             fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
             if not fitting:
                 raise OgPointcloudError(
-                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected the name "
-                    f"of a scene in {self.path} ({len(self.entries):,}), or a pattern"
+                    f"no scene is called '{pattern}'; expected the name of a scene in {self.path} "
+                    f"({len(self.entries):,}), or a pattern{did_you_mean(pattern, self.scenes)}"
                 )
             ids.update(self._by_name[name].id for name in fitting)
         return ids
