@@ -302,6 +302,10 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
         plotter.og.add_segmentation(mesh)
     with pytest.raises(og.OgPointcloudError, match="no point array 'og_label'"):
         plotter.og.show_labelled(mesh)
+    nameless = mesh.copy()
+    nameless["og_label"] = scene.instance_ids
+    with pytest.raises(og.OgPointcloudError, match=r"PolyData of 3,000 points has no field array 'og_names'"):
+        plotter.og.add_segmentation(nameless)
     with pytest.raises(og.OgPointcloudError, match="up is"):
         plotter.og.show_labelled(mesh.og.segment(["pear"], scene), up=(0, 0, 0))
     with pytest.raises(og.OgPointcloudError, match="expected 'label' or 'instance'"):

@@ -139,12 +139,13 @@ def check_in_world(mesh: pv.DataSet) -> None:
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
-    """Names of the labels in og_label; OgPointcloudError if the dataset has none."""
-    if LABEL not in mesh.point_data:
-        raise OgPointcloudError(
-            f"the {type(mesh).__name__} of {mesh.n_points:,} points has no point array '{LABEL}'; expected a segmented "
-            "dataset: mesh = mesh.og.segment(['chair', 'table'])"
-        )
+    """Names of the labels in og_label; OgPointcloudError if the dataset lacks either."""
+    for kind, data, name in (("point", mesh.point_data, LABEL), ("field", mesh.field_data, NAMES_FIELD)):
+        if name not in data:
+            raise OgPointcloudError(
+                f"the {type(mesh).__name__} of {mesh.n_points:,} points has no {kind} array '{name}'; expected a "
+                "segmented dataset: mesh = mesh.og.segment(['chair', 'table'])"
+            )
     return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES_FIELD]).ravel())
 
 
