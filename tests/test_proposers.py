@@ -349,5 +349,7 @@ def test_any_callable():
         as_proposals([*masks, masks[0, :5, :4]], (120, 160))
     with pytest.raises(SceneError, match="expected the same"):
         as_proposals(masks, (5, 5))
+    with pytest.raises(SceneError, match=r"a mask proposer returned NoneType .*; expected Proposals, bool"):
+        as_proposals(None, (120, 160))  # of a function that forgot its return
     with pytest.raises(SceneError, match="expected Proposals, bool"):
         as_proposals(masks.astype(float), (120, 160))

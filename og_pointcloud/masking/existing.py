@@ -51,7 +51,7 @@ def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
             raise SceneError(f"masks are {' and '.join(map(str, sorted(sizes)))}; expected all of {shape}")
         given = np.array(given) if given else np.zeros((0, *shape), np.bool_)
     masks = given.masks if isinstance(given, Proposals) else numbers_of(given)
-    if masks.shape[-2:] != shape:
+    if masks.ndim in (2, 3) and masks.shape[-2:] != shape:
         raise SceneError(f"masks are {masks.shape}, their image is {shape}; expected the same (H, W)")
     if isinstance(given, Proposals):
         return given
