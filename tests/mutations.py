@@ -399,13 +399,18 @@ MUTATIONS = (
     ),
     Mutation(
         "pieces of things stay pieces", "fitting/fragments.py",
-        "if not joined.any():", "if joined is not None:",
+        "while shares:", "while False:",
         ("test_fragments.py::test_pieces_that_a_table_parts_in_every_view_are_one_thing",),
     ),
     Mutation(
         "a border that tells nothing joins", "fitting/fragments.py",
-        "across = float(np.clip(np.median(share[seen & ~inside & ~alike]), MIN_SHARE, within))", "across = MIN_SHARE",
+        "return w, float(np.clip(np.median(share[across]), MIN_SHARE, w))", "return w, MIN_SHARE",
         ("test_fragments.py::test_two_things_stay_two",),
+    ),
+    Mutation(
+        "a piece of two things joins them", "fitting/fragments.py",
+        "        looks.join(first, second)\n", "",
+        ("test_fragments.py::test_things_are_not_joined_by_a_piece_of_both",),
     ),
     Mutation(
         "ids between ids are believed", "checking/check.py",

@@ -14,7 +14,16 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 from test_membership import groups, on_a_line, random_case
 
 from og_pointcloud.fitting import labellers
-from og_pointcloud.fitting.fragments import HIDDEN_BORDER_VIEWS, _alike, _borders, _log_ratio, join_fragments
+from og_pointcloud.fitting.fragments import (
+    HIDDEN_BORDER_VIEWS,
+    _Borders,
+    _borders,
+    _each_others_best,
+    _log_ratio,
+    _Looks,
+    _shares,
+    join_fragments,
+)
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import assign_and_correct_groups
@@ -23,6 +32,7 @@ from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
+THIRD = np.array([0, 0, 1, 0, 0, 0, 0, 0], np.float32)
 BACK, LEGS, FLOOR = range(50), range(50, 100), range(100, 150)
 N = 150
 IN_PIECES: HandView = [(BACK, ONE), (LEGS, ONE), (FLOOR, OTHER)]
@@ -134,32 +144,69 @@ def test_what_views_show_at_borders_is_that_of_the_literal_reference(seed: int) 
     borders = _borders(votes.by_point, table.mask_view, ids, near, visibility)
     assert list(zip(borders.first.tolist(), borders.second.tolist(), strict=True)) == sorted(expected)
     means = np.array([np.mean(expected[pair], axis=0) for pair in sorted(expected)])
-    np.testing.assert_allclose(np.stack([borders.one, borders.two], axis=1), means, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(borders.views.T, means, rtol=1e-4, atol=1e-6)
     assert len(expected) == 8 + 7
     assert (means > 0).any(axis=0).all()
 
 
+def borders_of(pairs: list[tuple[int, int]], one: list[float], two: list[float]) -> _Borders:
+    """Borders of two pairs of points each, in ascending order."""
+    return _Borders.between(np.array(pairs), 2 * np.array([one, two]).T, np.full(len(pairs), 2.0))
+
+
 def test_the_log_ratio_is_its_formula() -> None:
     """Two borders inside of groups, two of unlike ones, one of these hidden, and three of alike ones."""
-    pairs = [(0, 0), (1, 1), (0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
-    one = np.array([4.0, 2.0, 1.0, 0.01, 3.0, 0.0, 1.0])
-    two = np.array([0.0, 0.5, 3.0, 0.0, 0.0, 0.0, 2.0])
-    first, second = np.array(pairs, np.int32).T
-    alike = np.array([False, False, False, False, True, True, True])
+    pairs = [(0, 0), (0, 1), (1, 1), (1, 2), (2, 3), (3, 4), (4, 5)]
+    one, two = [4.0, 1.0, 2.0, 0.01, 3.0, 0.0, 1.0], [0.0, 3.0, 0.5, 0.0, 0.0, 0.0, 2.0]
+    borders, alike = borders_of(pairs, one, two), np.array([False] * 4 + [True] * 3)
     w, a = 0.9, 0.25  # the median of 4/4 and 2/2.5; the one that is seen
-    expected = (one + HIDDEN_BORDER_VIEWS) * np.log(w / a) + two * np.log((1 - w) / (1 - a))
-    borders: Any = SimpleNamespace(first=first, second=second, one=one, two=two)
-    np.testing.assert_allclose(_log_ratio(borders, alike), expected, rtol=1e-12)
+    assert _shares(borders, alike) == pytest.approx((w, a))
+    expected = (np.array(one) + HIDDEN_BORDER_VIEWS) * np.log(w / a) + np.array(two) * np.log((1 - w) / (1 - a))
+    np.testing.assert_allclose(_log_ratio(borders, w, a), expected, rtol=1e-12)
+
+
+def test_borders_of_joined_groups_count_together() -> None:
+    borders = borders_of([(0, 1), (0, 2), (1, 2), (2, 3)], [1.0, 2.0, 4.0, 8.0], [0.0, 0.0, 2.0, 0.0])
+    joined = borders.joined(np.array([0, 0, 2, 3]))
+    assert (joined.first.tolist(), joined.second.tolist()) == ([0, 0, 2], [0, 2, 3])
+    np.testing.assert_allclose(joined.views, [[1, 3, 8], [0, 1, 0]])
+    assert joined.size.tolist() == [2, 4, 2]
+
+
+def test_pairs_are_each_others_best() -> None:
+    """Two has a better partner than one; three and four would be best, but are not alike; five and six are too weak."""
+    borders = borders_of([(0, 1), (1, 2), (2, 3), (3, 4), (5, 6)], [1.0] * 5, [0.0] * 5)
+    ratio, alike = np.array([1.0, 2.0, 3.0, 9.0, 0.05]), np.array([True, True, True, False, True])
+    first, second = _each_others_best(borders, ratio, alike)
+    assert (first.tolist(), second.tolist()) == ([2], [3])
+    first, second = _each_others_best(borders, np.array([1.0, 1.0, 1.0, 9.0, 0.5]), alike)  # the lowest numbers first
+    assert sorted(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 1), (5, 6)]
+
+
+def test_things_are_not_joined_by_a_piece_of_both() -> None:
+    """Back and legs of two colors, and a piece between them that looks like either: it is joined with one of them."""
+    between = np.array([1, 1, *[0] * 6], np.float32) / np.sqrt(np.float32(2))
+    chain: HandView = [(range(40), ONE), (range(40, 60), between), (range(60, 100), OTHER), (FLOOR, THIRD)]
+    seams = [*range(37, 43), *range(57, 63)]
+    table, line = hand_table(N, [chain] * 4, [seams] * 4), on_a_line(N)
+    ids = np.repeat(np.arange(4, dtype=np.int32), [40, 20, 40, 50])
+    visible, near = np.ones(N, np.float32), around(line)
+    result, _ = join_fragments(groups([0, 1, 2, 3] * 4), table, view_votes(table), ids, near, visible)
+    assert result.count == 3
+    assert result.group[0] != result.group[2]
 
 
 def test_alike_is_what_is_nearer_to_one_group_than_to_different_things() -> None:
     """Masks of a group have a cosine of 1, those of a view 0 and 0.6 and 0.8: the middle of 1 and 0.6 is 0.8."""
     turned = np.array([0.6, 0.8, *[0] * 6], np.float32)
     table = hand_table(30, [[(range(10), ONE), (range(10, 20), OTHER), (range(20, 30), turned)]] * 3)
-    first, second = np.array([0, 0, 0, 1], np.int32), np.array([0, 1, 2, 2], np.int32)
-    assert _alike(groups([0, 1, 2] * 3), table, first, second).tolist() == [False, False, False, False]
+    borders = borders_of([(0, 0), (0, 1), (0, 2), (1, 2)], [1.0] * 4, [0.0] * 4)
+    assert _Looks.of_groups(groups([0, 1, 2] * 3), table).alike(borders).tolist() == [False, False, False, False]
     table = replace(table, mask_features=np.tile(np.stack([ONE, OTHER, turned + 0.01 * OTHER]), (3, 1)))
-    assert _alike(groups([0, 1, 2] * 3), table, first, second).tolist() == [False, False, False, True]
+    looks = _Looks.of_groups(groups([0, 1, 2] * 3), table)
+    assert looks.alike(borders).tolist() == [False, False, False, True]
+    looks.join(np.array([0]), np.array([1]))  # the mean over pairs of masks is what counts
+    assert looks.alike(borders_of([(0, 2)], [1.0], [0.0])).tolist() == [False]
 
 
 @pytest.mark.parametrize("hidden", [BEHIND_A_TABLE, range(0)])

@@ -24,8 +24,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.fitting.grouping import MaskGroups, cosines_within_views, indicator, ordered
 from og_pointcloud.fitting.mask_table import MaskTable
@@ -49,14 +47,38 @@ order of points."""
 
 @dataclass(frozen=True)
 class _Borders:
-    """Where groups adjoin. first, second: (borders,) int32, the two groups, the lower first; equal for the pairs of
-    points of one group that lie beside a border. one, two: (borders,) float64, means over pairs of points, as above.
-    """
+    """Where groups adjoin. first, second: (borders,) int64, the two groups, the lower first; equal for the pairs of
+    points of one group that lie beside a border. shown: (borders, 2) float64, sums of one and two over these pairs of
+    points. size: (borders,) float64, their number."""
 
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    one: NDArray[np.float64]
-    two: NDArray[np.float64]
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    shown: NDArray[np.float64]
+    size: NDArray[np.float64]
+
+    @classmethod
+    def between(cls, groups: NDArray[np.integer], shown: NDArray[np.float64], size: NDArray[np.float64]) -> _Borders:
+        """Sums over all rows of the same two groups. groups: (rows, 2), in any order."""
+        low, high = np.sort(groups, axis=1).astype(np.int64).T
+        count = int(high.max(initial=0)) + 1
+        key, border = np.unique(low * count + high, return_inverse=True)
+        sums = np.array([np.bincount(border, column, len(key)) for column in (*shown.T, size)], np.float64)
+        first, second = np.divmod(key, count)
+        return cls(first, second, sums[:2].T, sums[2])
+
+    def joined(self, whole: NDArray[np.int64]) -> _Borders:
+        """The borders of larger groups. whole: (groups,) the larger group that each belongs to."""
+        return _Borders.between(whole[np.stack([self.first, self.second], axis=1)], self.shown, self.size)
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """(borders,) whether both points of the pairs lie in one group."""
+        return self.first == self.second
+
+    @property
+    def views(self) -> NDArray[np.float64]:
+        """(2, borders) one and two, as above."""
+        return self.shown.T / self.size
 
 
 def join_fragments(
@@ -70,54 +92,101 @@ def join_fragments(
     """The groups, with those made one that are pieces of one thing, ordered by what they show, as before; and the group
     of each point.
 
+    Pairs that are each other's best are joined, then their masks and borders count together, until none is left.
     ids: (n,) int32, the group of each point as decided so far, below 0 none. visibility: (n,) in [0, 1], how openly
     points are seen.
     """
     borders = _borders(votes.by_point, table.mask_view, ids, around, visibility)
-    alike = _alike(groups, table, borders.first, borders.second)
-    joined = alike & (_log_ratio(borders, alike) > MIN_LOG_RATIO)
-    if not joined.any():
-        return groups, ids
-    ones, pieces = np.ones(np.count_nonzero(joined)), (borders.first[joined], borders.second[joined])
-    links: csr_array = csr_array((ones, pieces), shape=(groups.count, groups.count))
-    whole = connected_components(links, directed=False)[1]
-    grouped = np.flatnonzero(groups.group >= 0)
-    group = np.where(groups.group >= 0, whole[groups.group], -1)
+    looks = _Looks.of_groups(groups, table)
+    shares = _shares(borders, looks.alike(borders))
+    whole = np.arange(groups.count)
+    while shares:
+        first, second = _each_others_best(borders, _log_ratio(borders, *shares), looks.alike(borders))
+        if not len(first):
+            break
+        looks.join(first, second)
+        merged = np.arange(groups.count)
+        merged[second] = first
+        whole, borders = merged[whole], borders.joined(merged)
+    grouped = groups.group >= 0
+    group = np.where(grouped, whole[groups.group], -1) if groups.count else groups.group
     group, count = ordered(group, np.asarray(table.weights.sum(axis=1), np.float64).ravel())
+    if count == groups.count:
+        return groups, ids
     number = np.full(groups.count, -1, np.int32)
     number[groups.group[grouped]] = group[grouped]
     return MaskGroups(group, count, groups.spanning), np.where(ids >= 0, number[ids], ids)
 
 
-def _log_ratio(borders: _Borders, alike: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(borders,) the log-likelihood ratio of one thing to two; 0 where the borders of the scene say nothing."""
-    one, two, inside = borders.one, borders.two, borders.first == borders.second
+def _shares(borders: _Borders, alike: NDArray[np.bool_]) -> tuple[float, float] | None:
+    """w and a, medians over borders; None where the scene has none to tell."""
+    one, two = borders.views
     seen = one + two > HIDDEN_BORDER_VIEWS
+    within, across = seen & borders.inside, seen & ~borders.inside & ~alike
+    if not within.any() or not across.any():
+        return None
     share = one / np.maximum(one + two, np.finfo(np.float64).tiny)
-    if not (seen & inside).any() or not (seen & ~inside & ~alike).any():
-        return np.zeros(len(one))
-    within = float(np.clip(np.median(share[seen & inside]), MIN_SHARE, 1 - MIN_SHARE))
-    across = float(np.clip(np.median(share[seen & ~inside & ~alike]), MIN_SHARE, within))
-    return (one + HIDDEN_BORDER_VIEWS) * np.log(within / across) + two * np.log((1 - within) / (1 - across))
+    w = float(np.clip(np.median(share[within]), MIN_SHARE, 1 - MIN_SHARE))
+    return w, float(np.clip(np.median(share[across]), MIN_SHARE, w))
 
 
-def _alike(
-    groups: MaskGroups, table: MaskTable, first: NDArray[np.int32], second: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    """(borders,) whether the masks of two groups are alike. Cosines are means over pairs of masks: sums of features
-    have less noise, so any two are more alike. Never, where masks of one group are not more alike than others."""
-    features = table.unit_features.astype(np.float64)
-    described = features.any(axis=1)
-    member = indicator(np.where(described, groups.group, -1), groups.count)
-    total, masks = member @ features, np.asarray(member.sum(axis=1), np.float64)
-    several = masks > 1
-    own = ((total**2).sum(axis=1) - masks)[several] / (masks * (masks - 1))[several]
-    different = cosines_within_views(features[described], table.mask_view[described])
-    if not len(own) or not len(different) or np.median(own) <= np.median(different):
-        return np.zeros(len(first), np.bool_)
-    cosine = (total[first] * total[second]).sum(axis=1) / np.maximum(masks[first] * masks[second], 1)
-    least = ALIKE_SHARE * np.median(own) + (1 - ALIKE_SHARE) * np.median(different)
-    return (first != second) & (masks[first] * masks[second] > 0) & (cosine > least)
+def _log_ratio(borders: _Borders, w: float, a: float) -> NDArray[np.float64]:
+    """(borders,) the log-likelihood ratio of one thing to two."""
+    one, two = borders.views
+    return (one + HIDDEN_BORDER_VIEWS) * np.log(w / a) + two * np.log((1 - w) / (1 - a))
+
+
+def _each_others_best(
+    borders: _Borders, ratio: NDArray[np.float64], alike: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of alike groups with a sufficient ratio, of which each has no better partner (ties: the lowest numbers)."""
+    usable = np.flatnonzero(alike & (ratio > MIN_LOG_RATIO))
+    usable = usable[np.argsort(-ratio[usable], kind="stable")]
+    first, second = borders.first[usable], borders.second[usable]
+    # Where a group occurs for the first time, best pairs first, is its best pair.
+    occurring, earliest = np.unique(np.stack([first, second], axis=1), return_index=True)
+    best = np.full(int(occurring.max(initial=-1)) + 1, -1)
+    best[occurring] = earliest // 2
+    mutual = (best[first] == np.arange(len(usable))) & (best[second] == np.arange(len(usable)))
+    return first[mutual], second[mutual]
+
+
+@dataclass
+class _Looks:
+    """What the encoder says of groups. total: (groups, D) float64, sums of the unit features of their masks. masks:
+    (groups,) how many these are. least: masks of two groups are alike from this mean cosine on; None: none is."""
+
+    total: NDArray[np.float64]
+    masks: NDArray[np.float64]
+    least: float | None
+
+    @classmethod
+    def of_groups(cls, groups: MaskGroups, table: MaskTable) -> _Looks:
+        """None are alike where masks of one group are not more alike than those of one view."""
+        features = table.unit_features.astype(np.float64)
+        described = features.any(axis=1)
+        member = indicator(np.where(described, groups.group, -1), groups.count)
+        total, masks = member @ features, np.asarray(member.sum(axis=1), np.float64)
+        several = masks > 1
+        own = ((total**2).sum(axis=1) - masks)[several] / (masks * (masks - 1))[several]
+        different = cosines_within_views(features[described], table.mask_view[described])
+        if not len(own) or not len(different) or np.median(own) <= np.median(different):
+            return cls(total, masks, None)
+        return cls(total, masks, float(ALIKE_SHARE * np.median(own) + (1 - ALIKE_SHARE) * np.median(different)))
+
+    def alike(self, borders: _Borders) -> NDArray[np.bool_]:
+        """(borders,) whether the masks of two groups are alike. Cosines are means over pairs of masks: sums of features
+        have less noise, so any two are more alike."""
+        if self.least is None:
+            return np.zeros(len(borders.first), np.bool_)
+        pairs = self.masks[borders.first] * self.masks[borders.second]
+        cosine = (self.total[borders.first] * self.total[borders.second]).sum(axis=1) / np.maximum(pairs, 1)
+        return ~borders.inside & (pairs > 0) & (cosine > self.least)
+
+    def join(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> None:
+        """The masks of the second groups become those of the first."""
+        self.total[first] += self.total[second]
+        self.masks[first] += self.masks[second]
 
 
 def _borders(
@@ -136,10 +205,7 @@ def _borders(
     shown = _shown_together(pairs, point_votes[0], mask_view) * visibility[pairs].prod(axis=1, keepdims=True)
     # Rounded so that sums are exact and do not depend on the order of points.
     shown = np.rint(shown * _FIXED_POINT_SCALE) / _FIXED_POINT_SCALE
-    groups, border = np.unique(np.sort(ids[pairs], axis=1), axis=0, return_inverse=True)
-    size = np.bincount(border, minlength=len(groups))
-    one, two = (np.bincount(border, column, len(groups)) / size for column in shown.T)
-    return _Borders(groups[:, 0], groups[:, 1], one, two)
+    return _Borders.between(ids[pairs], shown, np.ones(len(pairs)))
 
 
 @njit(cache=True, parallel=True)
