@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ pytest.importorskip("rosbags")
 from commands import run
 from frame_messages import image_message, messages_of, place_of, stamp_of, transform
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
-from og_pointcloud_ros.frames import FrameAssembler
+from og_pointcloud_ros.frames import DEPTH_HEADER, FrameAssembler, compressed_image_array
 from og_pointcloud_ros.map_bags import BagFrames
 from og_pointcloud_ros.messages import plain_messages
 from rosbags.rosbag2 import Writer
@@ -22,8 +23,10 @@ import og_pointcloud as og
 from og_pointcloud.cli import main, map_
 from og_pointcloud.errors import SceneError
 
+cv2 = pytest.importorskip("cv2")
 TOPICS = {"info": "/camera_info", "depth": "/depth/image_rect", "color": "/color/image_rect", "masks": "/masks",
           "features": "/mask_features"}  # fmt: skip
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 KINDS = {"features": "sensor_msgs/msg/PointCloud2", "info": "sensor_msgs/msg/CameraInfo"}
 TWO_CAMERAS = {"back info": "/back/camera_info", "back color": "/back/image_rect", "info": "/front/camera_info",
                "depth": "/front/depth/image_rect", "masks": "/front/depth/masks", "features": "/front/features",
@@ -35,12 +38,13 @@ def write_bag(folder, given, without=(), messages=messages_of, topics=TOPICS):
     make = rosbags_messages(store)
     with Writer(folder, version=8) as bag:
         kinds = {topic: KINDS.get(role.split()[-1], "sensor_msgs/msg/Image") for role, topic in topics.items()}
+        kinds |= {topic: COMPRESSED for topic in topics.values() if topic.endswith(("/compressed", "/compressedDepth"))}
         kinds["/tf"] = "tf2_msgs/msg/TFMessage"
         out = {t: bag.add_connection(t, kind, typestore=store) for t, kind in kinds.items() if t not in without}
         for recorded, frame in enumerate(given):
             sent = {"/tf": transform(make, "map", "camera", *place_of(frame), stamp_of(frame))}
             sent |= {topics[role]: message for role, message in messages(make, frame).items()}
-            for topic in out:
+            for topic in sent.keys() & out:
                 bag.write(out[topic], recorded, store.serialize_cdr(sent[topic], kinds[topic]))
     return folder
 
@@ -267,3 +271,96 @@ def test_what_a_bag_lacks_is_named(tmp_path, role):
     bag = write_bag(tmp_path / "drive", frames(THINGS)[:1], without=(TOPICS[role],))
     with pytest.raises(SceneError, match=f"has no {role}; expected "):
         BagFrames(bag)
+
+
+def png(array):
+    return cv2.imencode(".png", array)[1].ravel()
+
+
+def compressed(make, message, form, data):
+    return make(COMPRESSED, header=message.header, format=form, data=data)
+
+
+def without_losses(make, frame):
+    """The messages of a frame as image_transport compresses them; colors as PNG, too."""
+    messages = messages_of(make, frame)
+    depth, masks = (1000 * frame.depth).round().astype(np.uint16), (frame.masks + 1).astype(np.uint16)
+    start = np.zeros(DEPTH_HEADER, np.uint8)
+    forms = {"depth": ("16UC1; compressedDepth png", np.r_[start, png(depth)]),
+             "masks": ("16UC1; png compressed ", png(masks)),
+             "color": ("rgb8; png compressed bgr8", png(frame.rgb[..., ::-1]))}  # fmt: skip
+    return messages | {role: compressed(make, messages[role], *form) for role, form in forms.items()}
+
+
+OF_TRANSPORTS = TOPICS | {"depth": "/depth/image_rect/compressedDepth", "color": "/color/image_rect/compressed",
+                          "masks": "/masks/compressed"}  # fmt: skip
+
+
+def test_compressed_images_are_read_as_the_others(tmp_path):
+    (frame,) = frames(THINGS)[:1]
+    (plain,) = BagFrames(write_bag(tmp_path / "plain", [frame]))
+    # Topics of raw images that nobody recorded are in many bags.
+    bag = write_bag(
+        tmp_path / "small", [frame], (), without_losses, OF_TRANSPORTS | {"silent color": "/color/image_rect"}
+    )
+    (read,) = BagFrames(bag)
+    for role in ("depth", "masks", "rgb", "features"):
+        np.testing.assert_array_equal(getattr(read, role), getattr(plain, role), role)
+
+
+def test_of_an_image_in_both_forms_the_uncompressed_one_is_read(tmp_path):
+    (frame,) = frames(THINGS)[:1]
+
+    def both(make, frame):
+        of_other = without_losses(make, replace(frame, rgb=255 - frame.rgb, depth=2 * frame.depth))
+        return messages_of(make, frame) | {f"{role} again": of_other[role] for role in ("depth", "color")}
+
+    topics = TOPICS | {f"{role} again": OF_TRANSPORTS[role] for role in ("depth", "color")}
+    (read,) = BagFrames(write_bag(tmp_path / "drive", [frame], (), both, topics))
+    np.testing.assert_array_equal(read.rgb, frame.rgb)
+    np.testing.assert_allclose(read.depth, frame.depth, atol=6e-4)
+
+
+def test_compressed_depth_in_meters_is_unpacked():
+    depth = np.array([[0, 0.5, 1.25], [3.0, 7.5, 0]])
+    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0  # the codec's defaults: steps of 1 / 100 at 1 m, up to 10 m
+    with np.errstate(divide="ignore"):
+        stored = np.where(depth > 0, a / depth + b, 0).astype(np.uint16)
+    data = np.r_[
+        np.frombuffer(np.array([0], "<i4").tobytes() + np.array([a, b], "<f4").tobytes(), np.uint8), png(stored)
+    ]
+    message = SimpleNamespace(format="32FC1; compressedDepth png", data=data)
+    read = compressed_image_array(message)
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read == 0, depth == 0)
+    np.testing.assert_allclose(read[depth > 0], depth[depth > 0], rtol=1e-3)
+    with pytest.raises(SceneError, match="compressedDepth of 32FC1 holds uint8"):
+        compressed_image_array(
+            SimpleNamespace(format=message.format, data=np.r_[data[:12], png(stored.astype(np.uint8))])
+        )
+
+
+def test_masks_that_were_changed_by_jpeg_are_left_out(tmp_path):
+    def as_jpeg(make, frame):
+        messages = without_losses(make, frame)
+        data = cv2.imencode(".jpg", (frame.masks + 1).astype(np.uint8))[1].ravel()
+        return messages | {"masks": compressed(make, messages["masks"], "mono8; jpeg compressed ", data)}
+
+    read = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:2], (), as_jpeg, OF_TRANSPORTS))
+    assert [frame.masks for frame in read] == [None, None]
+    assert any("masks are JPEG images, which change numbers" in reason for reason in read.dropped)
+
+
+def test_a_damaged_compressed_image_is_named():
+    with pytest.raises(SceneError, match=r"an image of format 'jpeg' \(40 bytes\) cannot be decoded"):
+        compressed_image_array(SimpleNamespace(format="jpeg", data=np.zeros(40, np.uint8)))
+
+
+def test_millimeters_as_floats_are_refused(tmp_path):
+    def in_millimeters(make, frame):
+        depth = image_message(make, (1000 * frame.depth).astype(np.float32), "32FC1", stamp_of(frame))
+        return messages_of(make, frame) | {"depth": depth}
+
+    read = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:1], (), in_millimeters))
+    assert not list(read)
+    assert any("expected meters in 32FC1 (REP 118)" in reason for reason in read.dropped)

@@ -127,16 +127,23 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
 
 
 def decoded(file: Path, flags: int) -> NDArray[np.generic]:
-    """The pixels as OpenCV decodes them. EXIF orientation is ignored, as poses and masks ignore it."""
+    """The pixels of a file as OpenCV decodes them: (H, W) or (H, W, channels), colors as BGR.
+
+    EXIF orientation is ignored, as poses and masks ignore it.
+    """
+    return decoded_bytes(np.fromfile(file, np.uint8), flags, file)
+
+
+def decoded_bytes(data: NDArray[np.uint8], flags: int, name: Path | str) -> NDArray[np.generic]:
+    """As `decoded`, of an image file's bytes. SceneError, which begins with ``name``, where they are none."""
     cv2 = require_cv2()
-    data = np.fromfile(file, np.uint8)
-    stated_size(io.BytesIO(data.tobytes()), file)  # refuses too many pixels before OpenCV allocates them
+    stated_size(io.BytesIO(data.tobytes()), name)  # refuses too many pixels before OpenCV allocates them
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise _undecodable(file, data.size)
+        raise _undecodable(name, data.size)
     return pixels
 
 
@@ -149,8 +156,8 @@ def palette_indices(file: Path) -> NDArray[np.uint8]:
         raise _undecodable(file, file.stat().st_size) from None
 
 
-def _undecodable(file: Path, size: int) -> SceneError:
-    return SceneError(f"{file} ({size} bytes) cannot be decoded as an image: it is damaged or truncated, copy it again")
+def _undecodable(name: Path | str, size: int) -> SceneError:
+    return SceneError(f"{name} ({size} bytes) cannot be decoded as an image: it is damaged or truncated, copy it again")
 
 
 def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -1,8 +1,9 @@
 """Messages of one stamp -> a frame of a map: depth and color images, masks with features, the camera.
 
 Depth is 16UC1 in millimeters or 32FC1 in meters (REP 118). Masks are 8UC1, 16UC1 or 32SC1: 0 none, else a number from
-1 on that is valid in this image only. A PointCloud2 with a field ``feature`` has one row per mask, the encoder's
-features of masks 1, 2, ... CameraInfo has pixel centers at integer coordinates.
+1 on that is valid in this image only. Any of them may be a CompressedImage, as image_transport's plugins `compressed`
+(PNG, or JPEG for colors) and `compressedDepth` (PNG) publish them. A PointCloud2 with a field ``feature`` has one row
+per mask, the encoder's features of masks 1, 2, ... CameraInfo has pixel centers at integer coordinates.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import lengths
+from og_pointcloud.formats.images import decoded_bytes, require_cv2
 from og_pointcloud.formats.poses import Sensor
 from og_pointcloud.mapping.frame import Frame
 from og_pointcloud.scene import Camera
@@ -30,6 +32,12 @@ ENCODINGS = {
     "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4),
 }  # fmt: skip
 """Encoding of an image -> type and number of its channels."""
+JPEG = b"\xff\xd8"
+"""First bytes of a JPEG file."""
+MAX_METERS = 250.0
+"""No camera measures a depth beyond it at most of its pixels: such numbers are millimeters."""
+DEPTH_HEADER = 12
+"""Bytes before the PNG of a `compressedDepth` image: an int32, and two float32 that depth in meters is coded by."""
 
 
 def image_array(message: Any) -> NDArray[Any]:
@@ -48,6 +56,25 @@ def image_array(message: Any) -> NDArray[Any]:
     pixels = np.ascontiguousarray(lines).view(kind).reshape(message.height, message.width, channels)
     pixels = pixels.astype(kind.newbyteorder("="))
     return pixels[..., 0] if channels == 1 else pixels[..., 2::-1] if encoding[0] == "b" else pixels[..., :3]
+
+
+def compressed_image_array(message: Any) -> NDArray[Any]:
+    """Pixels of a sensor_msgs/CompressedImage, as `image_array` gives those of the image that was compressed.
+
+    Its format is "ENCODING; compressed" or "ENCODING; compressedDepth" with details after it, or as from many
+    cameras' drivers only "jpeg" or "png". SceneError where it cannot be decoded.
+    """
+    encoding, _, how = str(message.format).partition(";")
+    data, start = np.asarray(message.data, np.uint8), DEPTH_HEADER if "compressedDepth" in how else 0
+    read = decoded_bytes(data[start:], require_cv2().IMREAD_UNCHANGED, f"an image of format '{message.format}'")
+    pixels: NDArray[Any] = np.asarray(read)
+    if start and encoding.strip() == "32FC1":
+        if pixels.dtype != np.uint16 or pixels.ndim != 2:
+            raise SceneError(f"compressedDepth of 32FC1 holds {pixels.dtype} {pixels.shape}; expected 16-bit gray")
+        # Stored is a / depth + b (compressed_depth_image_transport's codec), 0 where nothing was measured.
+        a, b = data[4:start].view("<f4").astype(np.float64)
+        return np.divide(a, pixels - b, out=np.zeros(pixels.shape), where=pixels > 0).astype(np.float32)
+    return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])
 
 
 @dataclass
@@ -90,7 +117,11 @@ class FrameAssembler:
         else:
             if role == "depth" or not parts.frame_id:  # a color camera may stand beside that of depth
                 parts.frame_id = message.header.frame_id
-            pixels = image_array(message)
+            if (compressed := hasattr(message, "format")) and role != "color" and bytes(message.data[:2]) == JPEG:
+                raise SceneError(
+                    f"{role} are JPEG images, which change numbers; expected PNG, compressedDepth or raw ones"
+                )
+            pixels = compressed_image_array(message) if compressed else image_array(message)
             if role == "color" and pixels.ndim == 2:  # of a gray camera
                 pixels = np.repeat(pixels[..., None], 3, axis=2)
             setattr(parts, role, pixels)
@@ -124,7 +155,7 @@ class FrameAssembler:
         if self._info is None:
             raise SceneError("no camera_info came with it")
         camera = _camera(self._info, self.rectified, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
-        depth = None if parts.depth is None else lengths(parts.depth)
+        depth = None if parts.depth is None else _meters(parts.depth)
         return Frame(camera, masks, features, depth, rgb=self._rgb(parts.color, camera), stamp=stamp / NANOSECONDS)
 
     def _rgb(self, color: NDArray[Any] | None, camera: Camera) -> NDArray[np.uint8] | None:
@@ -143,6 +174,17 @@ class FrameAssembler:
     def forget(self, stamp: int) -> None:
         """Drop a stamp."""
         self.waiting.pop(stamp, None)
+
+
+def _meters(stored: NDArray[Any]) -> NDArray[np.float32]:
+    """Depth in meters, 0 where none was measured. SceneError where it is stored as floats, but of millimeters."""
+    depth = lengths(stored)
+    if depth.any() and (median := float(np.median(depth[depth > 0]))) > MAX_METERS:
+        raise SceneError(
+            f"depth of {median:,.0f} m, the median of an image; expected meters in 32FC1 (REP 118), less than "
+            f"{MAX_METERS:.0f}: publish millimeters as 16UC1"
+        )
+    return depth
 
 
 def _camera(info: Any, rectified: bool, world_to_camera: NDArray[np.float64]) -> Camera:

@@ -2,9 +2,11 @@
 
 Topics are recognized by type and name: an Image with "depth" in its topic's name is depth, one with "mask" is masks,
 any other is color; a PointCloud2 with "feature" brings features (`frames`). The last part of a name decides:
-/depth/masks is masks. Of several cameras, the frames are those of the first depth topic in alphabetical order: its
-camera_info is the one with its frame_id, and the other topics are those whose names begin most like its own. Images are
-rectified where depth or masks have "rect" in their topic's name. Messages of one stamp are one frame.
+/depth/masks is masks. CompressedImages count by the name of the image that was compressed; where a bag holds both, the
+uncompressed ones are read. Topics without messages do not count. Of several cameras, the frames are those of the first
+depth topic in alphabetical order: its camera_info is the one with its frame_id, and the other topics are those whose
+names begin most like its own. Images are rectified where depth or masks have "rect" in their topic's name. Messages of
+one stamp are one frame.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from og_pointcloud_ros.frames import REQUIRED_ROLES, FrameAssembler
 from og_pointcloud_ros.transforms import TransformTree
 
 IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+TRANSPORTS = ("/compressed", "/compresseddepth")
+"""What image_transport appends to the topic of an image for that of the compressed one, in lower case."""
 MAX_PENDING_STAMPS = 100
 """Number of stamps that wait for their other messages; masks come seconds after their image."""
 
@@ -38,7 +43,7 @@ class BagFrames:
     def __init__(self, source: str | os.PathLike[str], frame: str = "map") -> None:
         self.source, self.frame, self.dropped = source, frame, Counter[str]()
         with open_bag(source) as reader:
-            topics = _topics_by_role([(c.topic, c.msgtype) for c in reader.connections], str(source))
+            topics = _topics_by_role([(c.topic, c.msgtype) for c in reader.connections if c.msgcount], str(source))
             if len(infos := topics["info"]) > 1:
                 topics["info"] = _infos_of_depth(reader, topics["depth"][0], infos)
         self._roles = {names[0]: role for role, names in topics.items()}
@@ -78,7 +83,7 @@ def _topics_by_role(topics: list[tuple[str, str]], source: str) -> dict[str, lis
     """Role -> its topics: first those that share most of the leading parts of their names with the first depth topic,
     then in alphabetical order."""
     found: dict[str, list[str]] = {}
-    for topic, kind in sorted(set(topics)):
+    for topic, kind in sorted(set(topics), key=lambda one: (one[1] == COMPRESSED_IMAGE, one)):
         if role := _role(topic.lower(), kind):
             found.setdefault(role, []).append(topic)
     for role, expected in (("depth", "an Image whose topic has 'depth' in its name"), ("info", "a CameraInfo"),
@@ -93,7 +98,9 @@ def _topics_by_role(topics: list[tuple[str, str]], source: str) -> dict[str, lis
 
 
 def _role(topic: str, kind: str) -> str | None:
-    if kind == IMAGE:
+    if kind in (IMAGE, COMPRESSED_IMAGE):
+        for transport in TRANSPORTS if kind == COMPRESSED_IMAGE else ():
+            topic = topic.removesuffix(transport)
         for part in reversed(topic.split("/")):
             if "mask" in part or "depth" in part:
                 return "masks" if "mask" in part else "depth"
