@@ -15,14 +15,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import BY_COLOR, HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
+from capture_files import BY_COLOR, HEIGHT, WIDTH, by_color, make_world, write_colmap_text, write_transforms
 from commands import error_of, output_of
-from PIL import Image
+from PIL import Image, ImageOps
 from scenes import write_image, write_ply
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.formats.images import EXIF_ORIENTATION, exif_quarter_turns
+from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.encode import DEMO_FOLDER
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
@@ -578,3 +580,62 @@ def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_p
     assert ALONE.folder is None  # a clone of OpenCV is no folder of masks
     assert MaskSettings(proposer="sam:facebook/sam-vit-base").threads == 1
     assert MaskSettings(encoder="openai/clip-vit-base-patch16").threads == 1
+
+
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+def test_turns_by_exif_are_those_of_pillow(tmp_path, orientation):
+    file, exif = tmp_path / "a.jpg", Image.Exif()
+    exif[EXIF_ORIENTATION] = orientation
+    Image.fromarray(scenery()).save(file, exif=exif)
+    with Image.open(file) as image:
+        stored, upright = np.asarray(image), np.asarray(ImageOps.exif_transpose(image))
+    turned = np.rot90(stored, exif_quarter_turns(file))
+    np.testing.assert_array_equal(turned, stored if orientation == 2 else upright)  # no camera mirrors
+
+
+def test_a_damaged_orientation_is_none(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(rotated_by_exif(0, scenery()).replace(b"II*\0\x08", b"II*\0\xff"))
+    assert exif_quarter_turns(tmp_path / "a.jpg") == 0
+
+
+class Watched:
+    """Proposer and encoder that keep what they are shown."""
+
+    feature_space = "none"
+
+    def __init__(self):
+        self.shown = []
+
+    def propose(self, image):
+        self.shown.append(image)
+        ids = by_color(image)
+        masks = ids == np.arange(ids.max() + 1)[:, None, None]
+        return Proposals(masks, np.ones(len(masks), np.float32))
+
+    def embed(self, image, masks):
+        self.shown.append(image)
+        return np.array([np.append(image[mask].mean(axis=0), mask.sum()) for mask in masks])
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@pytest.mark.parametrize("existing", [False, True])
+def test_models_see_images_upright_and_masks_are_for_the_stored_ones(tmp_path, monkeypatch, turns, existing):
+    make_capture(tmp_path / "c", 2)
+    make_masks(tmp_path / "c", QUICK, progress=False)
+    shutil.copytree(tmp_path / "c" / "masks", tmp_path / "given")
+    watched = Watched()
+    monkeypatch.setattr("og_pointcloud.masking.photographs.exif_quarter_turns", lambda _: turns)
+    monkeypatch.setattr("og_pointcloud.masking.worker.open_encoder", lambda *_: watched)
+    monkeypatch.setattr("og_pointcloud.masking.worker.open_proposer", lambda *_: watched)
+    proposer = str(tmp_path / "given") if existing else "opencv"
+    make_masks(tmp_path / "c", MaskSettings(proposer, encoder="any"), overwrite=True, progress=False)
+    for shown in watched.shown:
+        assert shown.shape[:2] == ((WIDTH, HEIGHT) if turns % 2 else (HEIGHT, WIDTH))
+    for k, view in enumerate(read_capture(tmp_path / "c").views):
+        ids, image = view.mask_map(), scenery(k)[..., ::-1]
+        np.testing.assert_array_equal(np.rot90(watched.shown[0 if k == 0 else len(watched.shown) // 2], -turns), image)
+        for mask, feature in enumerate(view.mask_features):
+            assert len(np.unique(image[ids == mask], axis=0)) == 1, "a mask is of one color, where it is stored"
+            expected = np.append(image[ids == mask].mean(axis=0), (ids == mask).sum())
+            np.testing.assert_allclose(feature, expected, rtol=1e-2)
+        assert len(view.mask_features) == (2 if existing else 3), "id 0 of a file is none"

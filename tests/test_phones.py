@@ -9,6 +9,7 @@ from scenes import ROOM_SIZE, camera, look, room_poses, write_depth, write_image
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
+from og_pointcloud.masking.photographs import read_photographs
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 WIDTH, HEIGHT = ROOM_SIZE
@@ -104,6 +105,24 @@ def test_cameras_and_depths_fit_the_room(app):
     cloud = fuse_capture(folder).points
     assert len(cloud) > 1000
     assert cloud.rgb is not None
+
+
+@pytest.mark.filterwarnings("ignore:.*no finite pose")
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@pytest.mark.parametrize("name", WRITERS)
+def test_masks_are_made_of_upright_images_however_the_phone_was_held(tmp_path, monkeypatch, name, turns):
+    rolled, held = np.eye(4), photographs()
+    sine, cosine = np.rint([np.sin(turns * np.pi / 2), np.cos(turns * np.pi / 2)])
+    rolled[:2, :2] = [
+        [cosine, -sine],
+        [sine, cosine],
+    ]  # the camera, clockwise as seen from behind: what it shows, the other way
+    to_app = np.eye(4)
+    if name != "ARKitScenes":  # the room is z up, the app's world y up
+        to_app[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    monkeypatch.setattr(f"{__name__}.photographs", lambda: [(k, to_app @ at @ rolled, depth) for k, at, depth in held])
+    WRITERS[name](tmp_path)
+    assert [photograph.quarter_turns for photograph in read_photographs(tmp_path)] == [-turns % 4] * 4
 
 
 def test_frames_without_a_partner_are_left_out(app):

@@ -6,9 +6,10 @@ import io
 import os
 import posixpath
 import re
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,20 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import write_file
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 LEADS_OUT = re.compile(r"/|\.\.(?:/|$)|[A-Za-z]:/")
 """Beginnings of normalized paths that lead out of a folder, also on Windows."""
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
+
+
+EXIF_ORIENTATION = 0x0112
+EXIF_QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
+"""Orientations that cameras write, but for upright -> quarter turns, counter-clockwise, that undo them."""
 
 
 class PngHeader(NamedTuple):
@@ -94,6 +103,18 @@ def image_size(file: Path) -> tuple[int, int]:
     return size
 
 
+def exif_quarter_turns(file: Path) -> int:
+    """Quarter turns, counter-clockwise, by which its camera says that the stored image must be turned to stand upright;
+    0 where the file says nothing."""
+    with file.open("rb") as stream:
+        image = _opened(stream, file)
+        if image is None or image.format == "PNG":  # Pillow would decode a PNG for it, and cameras write none
+            return 0
+        with suppress(Exception):  # many types: of damaged tags
+            return EXIF_QUARTER_TURNS.get(image.getexif().get(EXIF_ORIENTATION, 1), 0)
+    return 0
+
+
 def _check_pixels(name: Path | str, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise SceneError(
@@ -106,6 +127,15 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
 
     No pixel is decoded. SceneError, which begins with ``name``, beyond MAX_PIXELS.
     """
+    image = _opened(stream, name)
+    if image is None:
+        return None
+    _check_pixels(name, *image.size)
+    return image.size
+
+
+def _opened(stream: BinaryIO, name: Path | str) -> Image | None:
+    """A PNG, JPEG, BMP, WebP or TIFF of which only the header is read; None for other files."""
     pillow = require_pillow()
     from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
 
@@ -116,13 +146,11 @@ def stated_size(stream: BinaryIO, name: Path | str) -> tuple[int, int] | None:
     for kind in kinds:  # not Image.open, which warns of images from two thirds of MAX_PIXELS on
         stream.seek(0)
         try:
-            width, height = kind(stream).size
+            return kind(stream)
         except pillow.DecompressionBombError as error:  # raised by WebP's own reader
             raise SceneError(f"{name}: {error}; expected at most {MAX_PIXELS} pixels: scale it down") from None
         except Exception:  # many types: readers fail in many ways on foreign or damaged headers
             continue
-        _check_pixels(name, width, height)
-        return width, height
     return None
 
 

@@ -10,7 +10,8 @@ ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_w
                 translation, world to camera, OpenCV's axes. An image gets the pose nearest in time, if within 10 ms.
 
 Image and depth image differ in size but share a lens. Worlds are in meters and kept as they are, so that clouds
-exported by the apps (y up) fit. Images are in the sensor's landscape orientation, however the phone was held.
+exported by the apps (y up) fit. Images are in the sensor's landscape orientation, however the phone was held; masks are
+made of them upright.
 """
 
 from __future__ import annotations
@@ -40,6 +41,8 @@ from og_pointcloud.formats.poses import (
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+Y_UP, Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+"""ARKit's world is y up; in ARKitScenes it was turned to z up."""
 MAX_OFFSET_S = 0.01
 """Largest time between an image and its pose."""
 PINCAM_SHIFTS_S = -0.001, 0.001
@@ -65,7 +68,7 @@ def _polycam(folder: Path) -> Iterator[RecordedFrame]:
         content = read_json_object(source)
         sensor = _sensor(*named_numbers(content, POLYCAM_KEYS, source))
         pose = np.reshape(named_numbers(content, POSE_KEYS, source), (3, 4)) * OPENGL_SIGNS
-        yield RecordedFrame(path, source, pose, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"))
+        yield RecordedFrame(path, source, pose, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"), Y_UP)
 
 
 def _is_scanner_app(folder: Path) -> bool:
@@ -83,7 +86,7 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
         # 3 x 3, row by row.
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
         sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)  # it counts pixel centers at whole numbers
-        yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth))
+        yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth), Y_UP)
 
 
 def _is_arkit_scenes(folder: Path) -> bool:
@@ -107,7 +110,7 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
         width, height, fx, fy, cx, cy = named_numbers(read_numbers(lens, 6).ravel(), range(6), lens)
         sensor = _sensor(width, height, fx, fy, cx + 0.5, cy + 0.5)
         pose = inverse(rigid(rotation_of_vector(nearest[1:4]), nearest[4:7]))  # stored world to camera
-        yield RecordedFrame(path, lens, pose, sensor, (sensor, folder / "lowres_depth" / file.name))
+        yield RecordedFrame(path, lens, pose, sensor, (sensor, folder / "lowres_depth" / file.name), Z_UP)
 
 
 PHONE_LAYOUTS = ((_is_polycam, _polycam), (_is_scanner_app, _scanner_app), (_is_arkit_scenes, _arkit_scenes))

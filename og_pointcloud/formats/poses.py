@@ -37,7 +37,8 @@ class PosedImage:
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
     lens: None for a pinhole. depth: the depth image that the pose file or data set has for it.
     face: the view's part of the image; None if the image is the view. depth_unit, integer_depth_unit: as the pose file
-    states them, for a depth image that it does not name; as in `DepthFile`.
+    states them, for a depth image that it does not name; as in `DepthFile`. up: where up is in the world, if the data
+    set says so.
     """
 
     path: str
@@ -47,6 +48,7 @@ class PosedImage:
     face: Face | None = None
     depth_unit: float | None = None
     integer_depth_unit: float | None = None
+    up: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class RecordedFrame:
 
     path: of the image, in the capture folder. source: where the pose comes from, for errors. pose: camera to world,
     OpenCV axes; None, or not finite, where tracking was lost. color: the image's sensor; None if unknown.
-    depth: the depth sensor, and a file that may be absent.
+    depth: the depth sensor, and a file that may be absent. up: of the world, where it is known.
     """
 
     path: str
@@ -96,6 +98,7 @@ class RecordedFrame:
     pose: DoubleArray | None = None
     color: Sensor | None = None
     depth: tuple[Sensor, Path] | None = None
+    up: tuple[float, float, float] | None = None
 
     def image(self) -> PosedImage | None:
         """The posed image, None without a pose."""
@@ -106,7 +109,7 @@ class RecordedFrame:
             if self.depth is not None and self.depth[1].is_file():
                 sensor, path = self.depth
                 file = DepthFile(path, sensor.at(self.pose), sensor.unit)
-        return PosedImage(self.path, camera, depth=file)
+        return PosedImage(self.path, camera, depth=file, up=self.up)
 
 
 def recorded(frames: Iterable[RecordedFrame]) -> PosedFrames:

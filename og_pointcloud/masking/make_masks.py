@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
@@ -147,7 +148,8 @@ def _state_of(photograph: Photograph) -> list[Any]:
     """What decides the pixels of a photograph. Those of a face depend on the lens."""
     face = photograph.face
     cameras = [] if face is None else [[of.width, of.height, *of.intrinsics] for of in (face.camera, face.whole)]
-    return [photograph.name, *_state(photograph.file), *cameras, *([asdict(face.lens)] if face else [])]
+    turns = [photograph.quarter_turns] if photograph.quarter_turns else []
+    return [photograph.name, *_state(photograph.file), *cameras, *([asdict(face.lens)] if face else []), *turns]
 
 
 def _state(file: Path) -> tuple[str, int, int]:
@@ -174,14 +176,20 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
         # So that wrong masks are noticed after the first images, not after a night.
         done = [] if previewed else [task for task in tasks if task.work_file.exists()]
         if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
-            shown = [(task.photograph.read(settings.longest_side), task.work_file) for task in done[:PREVIEW_IMAGES]]
-            write_contact_sheet(target / PREVIEW_NAME, [(image, read_work(file)["ids"]) for image, file in shown])
+            write_contact_sheet(target / PREVIEW_NAME, [_shown(task, settings) for task in done[:PREVIEW_IMAGES]])
             previewed = True
     if broken:
         raise SceneError(
             f"{len(broken)} of {len(tasks)} images cannot be used, the first: {broken[0]}; masks of the others are "
             f"kept in '{target / WORK_FOLDER}': repair or remove these images, then run the same command again"
         )
+
+
+def _shown(task: ImageTask, settings: MaskSettings) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """An image and its ids, upright."""
+    photograph = task.photograph
+    image, ids = photograph.read(settings.longest_side), read_work(task.work_file)["ids"]
+    return np.rot90(image, photograph.quarter_turns), np.rot90(ids, photograph.quarter_turns)
 
 
 # The final files, and the record by which the next run recognizes them --------------------------------------------

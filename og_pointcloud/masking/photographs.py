@@ -13,7 +13,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.faces import Face
-from og_pointcloud.formats.images import image_size, require_cv2, require_scaled, write_png
+from og_pointcloud.formats.images import exif_quarter_turns, image_size, require_cv2, require_scaled, write_png
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
@@ -28,6 +28,7 @@ class Photograph:
     face: None where masks are made on the image as it is; they are undistorted when they are read. An image that no
     pinhole can show becomes several photographs, each a face of a cube: models are trained on pinhole images, and no
     border of a panorama cuts a thing in two.
+    quarter_turns: how often it must be turned by 90 degrees, counter-clockwise, to stand upright.
     """
 
     name: str
@@ -35,10 +36,11 @@ class Photograph:
     file: Path
     camera: Camera
     face: Face | None = None
+    quarter_turns: int = 0
 
     def read(self, longest_side: int) -> NDArray[np.uint8]:
-        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Gray, 16-bit and alpha become 8-bit RGB; EXIF
-        orientation is ignored, as poses ignore it."""
+        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Gray, 16-bit and alpha become 8-bit RGB. Not
+        turned upright: poses are for the pixels as stored, and ignore EXIF orientation."""
         width, height = image_size(self.file)
         if self.face is not None:
             camera = self.face.of_whole_size(width, height).camera
@@ -71,8 +73,16 @@ def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
     )
     require_scaled(f"{file} is", image_size(file), (whole.width, whole.height), cure)
     if image.face is None or not image.face.name:
-        return Photograph(name, image.path, file, whole)
+        return Photograph(name, image.path, file, whole, None, _turns_upright(image, file))
     return Photograph(name, image.path, file, image.camera, image.face)
+
+
+def _turns_upright(image: PosedImage, file: Path) -> int:
+    """Quarter turns by gravity where the data set says where up is, else by the file's EXIF orientation."""
+    if image.up is None:
+        return exif_quarter_turns(file)
+    right, down, _ = image.camera.world_to_camera[:3, :3] @ np.array(image.up)
+    return int(np.argmax([-down, right, down, -right]))
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.int32]]]) -> None:

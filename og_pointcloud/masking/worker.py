@@ -48,20 +48,25 @@ class ImageWorker:
         try:
             image = task.photograph.read(self.settings.longest_side)
             with replacing(task.work_file) as file:
-                np.savez_compressed(file, **self._masks(image, task.photograph.name))
+                np.savez_compressed(file, **self._masks(image, task.photograph))
         except SceneError as error:
             return str(error)
         return None
 
-    def _masks(self, image: NDArray[np.uint8], name: str) -> dict[str, Any]:
-        """The arrays of a work file: the id map at the chosen level, and features and tracks of its masks."""
-        proposer = self.proposer
-        existing = isinstance(proposer, ExistingMasks)
-        proposals = proposer.of(name, image.shape[:2]) if existing else proposer.propose(image)
+    def _masks(self, image: NDArray[np.uint8], photograph: Photograph) -> dict[str, Any]:
+        """The arrays of a work file: the id map at the chosen level, and features and tracks of its masks.
+
+        Models see the image upright, as those were that they learned from; ids are for the image as stored.
+        """
+        proposer, turns = self.proposer, photograph.quarter_turns
+        upright = np.ascontiguousarray(np.rot90(image, turns))
+        existing = isinstance(proposer, ExistingMasks)  # of the image as stored
+        proposals = proposer.of(photograph.name, image.shape[:2]) if existing else proposer.propose(upright)
         ids, chosen = masks_of_level(proposals, self.settings.level)
-        masks = ids == np.arange(ids.max(initial=-1) + 1)[:, None, None]
+        ids, of_upright = (ids, np.rot90(ids, turns)) if existing else (np.rot90(ids, -turns), ids)
+        masks = of_upright == np.arange(ids.max(initial=-1) + 1)[:, None, None]
         space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
-        features = self.encoder.embed(image, masks) if self.encoder else np.zeros((len(masks), 1))
+        features = self.encoder.embed(upright, masks) if self.encoder else np.zeros((len(masks), 1))
         # Components of unit vectors lose at most 0.05 % in 16 bits.
         made = {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
         return made if proposals.tracks is None else {**made, "tracks": proposals.tracks[chosen]}
