@@ -185,8 +185,9 @@ def test_pairs_are_each_others_best() -> None:
 
 def test_things_are_not_joined_by_a_piece_of_both() -> None:
     """Back and legs of two colors, and a piece between them that looks like either: it is joined with one of them."""
-    between = np.array([1, 1, *[0] * 6], np.float32) / np.sqrt(np.float32(2))
-    chain: HandView = [(range(40), ONE), (range(40, 60), between), (range(60, 100), OTHER), (FLOOR, THIRD)]
+    angles = np.radians([0, 30, 60])
+    back, between, legs = np.stack([np.cos(angles), np.sin(angles), *[0 * angles] * 6], axis=1).astype(np.float32)
+    chain: HandView = [(range(40), back), (range(40, 60), between), (range(60, 100), legs), (FLOOR, THIRD)]
     seams = [*range(37, 43), *range(57, 63)]
     table, line = hand_table(N, [chain] * 4, [seams] * 4), on_a_line(N)
     ids = np.repeat(np.arange(4, dtype=np.int32), [40, 20, 40, 50])
@@ -196,13 +197,15 @@ def test_things_are_not_joined_by_a_piece_of_both() -> None:
     assert result.group[0] != result.group[2]
 
 
-def test_alike_is_what_is_nearer_to_one_group_than_to_different_things() -> None:
-    """Masks of a group have a cosine of 1, those of a view 0 and 0.6 and 0.8: the middle of 1 and 0.6 is 0.8."""
-    turned = np.array([0.6, 0.8, *[0] * 6], np.float32)
+def test_alike_is_what_is_much_nearer_to_one_group_than_to_different_things() -> None:
+    """Masks of a group have a cosine of 1, those of a view 0, 0.6 and 0.8: four fifths of the way to 1 are at 0.92."""
+    turned, further = np.array([[0.6, 0.8, *[0] * 6], [0.28, 0.96, *[0] * 6]], np.float32)
     table = hand_table(30, [[(range(10), ONE), (range(10, 20), OTHER), (range(20, 30), turned)]] * 3)
     borders = borders_of([(0, 0), (0, 1), (0, 2), (1, 2)], [1.0] * 4, [0.0] * 4)
-    assert _Looks.of_groups(groups([0, 1, 2] * 3), table).alike(borders).tolist() == [False, False, False, False]
-    table = replace(table, mask_features=np.tile(np.stack([ONE, OTHER, turned + 0.01 * OTHER]), (3, 1)))
+    looks = _Looks.of_groups(groups([0, 1, 2] * 3), table)
+    assert looks.least == pytest.approx(0.92)
+    assert looks.alike(borders).tolist() == [False, False, False, False]
+    table = replace(table, mask_features=np.tile(np.stack([ONE, OTHER, further]), (3, 1)))
     looks = _Looks.of_groups(groups([0, 1, 2] * 3), table)
     assert looks.alike(borders).tolist() == [False, False, False, True]
     looks.join(np.array([0]), np.array([1]))  # the mean over pairs of masks is what counts

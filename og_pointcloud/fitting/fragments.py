@@ -35,7 +35,7 @@ HIDDEN_BORDER_VIEWS = 0.1
 """Every border counts as if so much of a view, besides those that see it, showed one thing there."""
 MIN_LOG_RATIO = 0.1
 """Groups are joined from this log-likelihood ratio on."""
-ALIKE_SHARE = 0.5
+ALIKE_SHARE = 0.8
 """Masks are alike from this share of the way on from the typical cosine of different things to that of one group."""
 MIN_SHARE = 0.01
 """No share w or a is nearer to 0 or 1 than this."""
