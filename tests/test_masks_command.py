@@ -582,6 +582,14 @@ def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_p
     assert MaskSettings(encoder="openai/clip-vit-base-patch16").threads == 1
 
 
+def test_a_pose_file_that_is_not_read_need_not_make_sense(tmp_path):
+    make_capture(tmp_path / "c")
+    (tmp_path / "c" / "transforms_train.json").write_text("{}")
+    made = make_masks(tmp_path / "c", replace(QUICK, every=2), tmp_path / "half", progress=False)
+    assert made.images == 2
+    assert len(read_capture(tmp_path / "half").views) == 2
+
+
 @pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
 def test_turns_by_exif_are_those_of_pillow(tmp_path, orientation):
     file, exif = tmp_path / "a.jpg", Image.Exif()

@@ -269,11 +269,12 @@ def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) 
     """Write poses of the chosen images, and links to everything else that the capture has and the target lacks."""
     kept = {photograph.path for photograph in chosen}
     others = {MASKS_FOLDER, FEATURES_NAME, LANGUAGE_FEATURES_FOLDER, WORK_FOLDER}
+    pose_file = next((name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)  # the others are not read
     for source in sorted(capture.resolve().iterdir()):
         if source.name in others or source == target.resolve():  # the target may lie in the capture
             continue
         place = target / source.name
-        if source.name in TRANSFORMS_NAMES:
+        if source.name == pose_file:
             content = read_json_object(source)
             frames = content["frames"]
             content["frames"] = [frame for frame in frames if frame["file_path"].replace("\\", "/") in kept]
