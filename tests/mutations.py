@@ -413,6 +413,11 @@ MUTATIONS = (
         ("test_fragments.py::test_things_are_not_joined_by_a_piece_of_both",),
     ),
     Mutation(
+        "many masks are as little alike as few", "fitting/fragments.py",
+        "np.sqrt(np.maximum(masks.min(axis=0), 1))", "1.0",
+        ("test_fragments.py::test_few_masks_may_differ_more_than_many",),
+    ),
+    Mutation(
         "ids between ids are believed", "checking/check.py",
         "MAX_BLENDED_SHARE = 0.004", "MAX_BLENDED_SHARE = 2",
         ("test_checking.py::test_pictures_of_ids_that_were_blended_are_told",),

@@ -198,18 +198,28 @@ def test_things_are_not_joined_by_a_piece_of_both() -> None:
 
 
 def test_alike_is_what_is_much_nearer_to_one_group_than_to_different_things() -> None:
-    """Masks of a group have a cosine of 1, those of a view 0, 0.6 and 0.8: four fifths of the way to 1 are at 0.92."""
+    """Masks of a group have a cosine of 1, those of a view 0, 0.6 and 0.8: of three masks, 0.61 of the way to 1 are at
+    0.84."""
     turned, further = np.array([[0.6, 0.8, *[0] * 6], [0.28, 0.96, *[0] * 6]], np.float32)
     table = hand_table(30, [[(range(10), ONE), (range(10, 20), OTHER), (range(20, 30), turned)]] * 3)
     borders = borders_of([(0, 0), (0, 1), (0, 2), (1, 2)], [1.0] * 4, [0.0] * 4)
     looks = _Looks.of_groups(groups([0, 1, 2] * 3), table)
-    assert looks.least == pytest.approx(0.92)
+    assert (looks.own, looks.different) == (pytest.approx(1), pytest.approx(0.6))
     assert looks.alike(borders).tolist() == [False, False, False, False]
     table = replace(table, mask_features=np.tile(np.stack([ONE, OTHER, further]), (3, 1)))
     looks = _Looks.of_groups(groups([0, 1, 2] * 3), table)
     assert looks.alike(borders).tolist() == [False, False, False, True]
     looks.join(np.array([0]), np.array([1]))  # the mean over pairs of masks is what counts
     assert looks.alike(borders_of([(0, 2)], [1.0], [0.0])).tolist() == [False]
+
+
+def test_few_masks_may_differ_more_than_many() -> None:
+    turned = np.array([np.sqrt(1 - 0.88**2), 0.88, *[0] * 6], np.float32)
+    view: HandView = [(range(10), ONE), (range(10, 20), OTHER), (range(20, 30), turned)]
+    between = borders_of([(1, 2)], [1.0], [0.0])
+    few, many = (_Looks.of_groups(groups([0, 1, 2] * n), hand_table(30, [view] * n)) for n in (3, 30))
+    assert few.alike(between).tolist() == [True]
+    assert many.alike(between).tolist() == [False]
 
 
 @pytest.mark.parametrize("hidden", [BEHIND_A_TABLE, range(0)])

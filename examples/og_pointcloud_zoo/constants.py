@@ -59,6 +59,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.fragments.HIDDEN_BORDER_VIEWS": ("", ()),
     "fitting.fragments.MIN_LOG_RATIO": ("", ()),
     "fitting.fragments.ALIKE_SHARE": ("", ()),
+    "fitting.fragments.ALIKE_SHARE_LESS": ("", ()),
     "fitting.looks.MIN_LOOK_MASKS": ("", ()),
     "fitting.mask_edges.MIN_CONTRAST_RATIO": ("table", ()),
     "fitting.mask_edges.MIN_STANDARD_ERRORS": ("table", ()),

@@ -35,8 +35,11 @@ HIDDEN_BORDER_VIEWS = 0.1
 """Every border counts as if so much of a view, besides those that see it, showed one thing there."""
 MIN_LOG_RATIO = 0.1
 """Groups are joined from this log-likelihood ratio on."""
-ALIKE_SHARE = 0.8
-"""Masks are alike from this share of the way on from the typical cosine of different things to that of one group."""
+ALIKE_SHARE = 0.9
+"""Masks of two groups are alike from this share of the way on from the typical cosine of different things to that of
+one group, less what follows."""
+ALIKE_SHARE_LESS = 0.5
+"""The share is less by this, over the root of the number of masks of the smaller group: few differ more by chance."""
 MIN_SHARE = 0.01
 """No share w or a is nearer to 0 or 1 than this."""
 
@@ -154,11 +157,12 @@ def _each_others_best(
 @dataclass
 class _Looks:
     """What the encoder says of groups. total: (groups, D) float64, sums of the unit features of their masks. masks:
-    (groups,) how many these are. least: masks of two groups are alike from this mean cosine on; None: none is."""
+    (groups,) how many these are. own, different: typical cosines of masks of one group, and of different things."""
 
     total: NDArray[np.float64]
     masks: NDArray[np.float64]
-    least: float | None
+    own: float
+    different: float
 
     @classmethod
     def of_groups(cls, groups: MaskGroups, table: MaskTable) -> _Looks:
@@ -170,18 +174,19 @@ class _Looks:
         several = masks > 1
         own = ((total**2).sum(axis=1) - masks)[several] / (masks * (masks - 1))[several]
         different = cosines_within_views(features[described], table.mask_view[described])
-        if not len(own) or not len(different) or np.median(own) <= np.median(different):
-            return cls(total, masks, None)
-        return cls(total, masks, float(ALIKE_SHARE * np.median(own) + (1 - ALIKE_SHARE) * np.median(different)))
+        if not len(own) or not len(different):
+            return cls(total, masks, 0.0, 0.0)
+        return cls(total, masks, float(np.median(own)), float(np.median(different)))
 
     def alike(self, borders: _Borders) -> NDArray[np.bool_]:
         """(borders,) whether the masks of two groups are alike. Cosines are means over pairs of masks: sums of features
         have less noise, so any two are more alike."""
-        if self.least is None:
-            return np.zeros(len(borders.first), np.bool_)
-        pairs = self.masks[borders.first] * self.masks[borders.second]
+        masks = np.stack([self.masks[borders.first], self.masks[borders.second]])
+        pairs = masks.prod(axis=0)
+        usable = ~borders.inside & (pairs > 0) & (self.own > self.different)
         cosine = (self.total[borders.first] * self.total[borders.second]).sum(axis=1) / np.maximum(pairs, 1)
-        return ~borders.inside & (pairs > 0) & (cosine > self.least)
+        share = ALIKE_SHARE - ALIKE_SHARE_LESS / np.sqrt(np.maximum(masks.min(axis=0), 1))
+        return usable & (cosine > self.different + share * (self.own - self.different))
 
     def join(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> None:
         """The masks of the second groups become those of the first."""
