@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import SceneError, printable
 from og_pointcloud.formats.depth import lengths
 from og_pointcloud.formats.images import decoded_bytes, require_cv2
 from og_pointcloud.formats.poses import Sensor
@@ -66,7 +66,9 @@ def compressed_image_array(message: Any) -> NDArray[Any]:
     """
     encoding, _, how = str(message.format).partition(";")
     data, start = np.asarray(message.data, np.uint8), DEPTH_HEADER if "compressedDepth" in how else 0
-    read = decoded_bytes(data[start:], require_cv2().IMREAD_UNCHANGED, f"an image of format '{message.format}'")
+    read = decoded_bytes(
+        data[start:], require_cv2().IMREAD_UNCHANGED, f"an image of format '{printable(message.format, 40)}'"
+    )
     pixels: NDArray[Any] = np.asarray(read)
     if start and encoding.strip() == "32FC1":
         if pixels.dtype != np.uint16 or pixels.ndim != 2:
