@@ -15,8 +15,8 @@ groups whose masks are not alike, a share a. The log-likelihood ratio of one thi
     (one + HIDDEN_BORDER_VIEWS) log(w / a) + two log((1 - w) / (1 - a))
 
 where the constant speaks for borders that hardly any view sees: two things of one kind mostly touch where they can be
-seen. Groups whose masks are alike, and whose ratio exceeds MIN_LOG_RATIO, become one. Alike is what is nearly as like as
-masks of one group: one false pair, of two brown things say, names both wrongly.
+seen. Groups whose masks are alike, and whose ratio exceeds MIN_LOG_RATIO, become one. Alike is what is nearly as like
+as masks of one group: one false pair, of two brown things say, names both wrongly.
 """
 
 from __future__ import annotations
