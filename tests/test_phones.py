@@ -113,10 +113,8 @@ def test_cameras_and_depths_fit_the_room(app):
 def test_masks_are_made_of_upright_images_however_the_phone_was_held(tmp_path, monkeypatch, name, turns):
     rolled, held = np.eye(4), photographs()
     sine, cosine = np.rint([np.sin(turns * np.pi / 2), np.cos(turns * np.pi / 2)])
-    rolled[:2, :2] = [
-        [cosine, -sine],
-        [sine, cosine],
-    ]  # the camera, clockwise as seen from behind: what it shows, the other way
+    # The camera, clockwise as seen from behind: what it shows, the other way.
+    rolled[:2, :2] = [[cosine, -sine], [sine, cosine]]
     to_app = np.eye(4)
     if name != "ARKitScenes":  # the room is z up, the app's world y up
         to_app[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
