@@ -345,6 +345,11 @@ class LabelledCloud:
         return self.instances.overall_reliability
 
     @property
+    def counted_points(self) -> NDArray[np.int32]:
+        """(K,) int32, the points of each instance, counted by their ids."""
+        return np.bincount(self.instance_ids[self.instance_ids >= 0], minlength=len(self.instances)).astype(np.int32)
+
+    @property
     def xyz_world(self) -> NDArray[np.float64]:
         """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin

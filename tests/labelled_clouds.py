@@ -42,7 +42,7 @@ def instance_table(count: int, owners: list[int] | None = None, width: int = WID
 def make_cloud(xyz, ids, spacing=0.05, reach=0.15, origin=(0, 0, 0), instances=None, words=WORDS) -> LabelledCloud:
     xyz = np.asarray(xyz, np.float32).reshape(-1, 3)
     ids = np.asarray(ids, np.int32)
-    return LabelledCloud(
+    cloud = LabelledCloud(
         xyz=xyz,
         origin=np.array(origin, np.float64),
         instance_ids=ids,
@@ -54,6 +54,7 @@ def make_cloud(xyz, ids, spacing=0.05, reach=0.15, origin=(0, 0, 0), instances=N
         vocabulary=Vocabulary(tuple(words), 10 * unit_rows(len(words), seed=0)) if words else None,
         provenance={"seed": 3, "left_out": []},
     )
+    return replace(cloud, instances=replace(cloud.instances, points=cloud.counted_points))
 
 
 def room(count: int = 3000, seed: int = 0) -> LabelledCloud:
@@ -85,7 +86,7 @@ def tough_clouds() -> dict[str, LabelledCloud]:
         "no instance, no words, no width": make_cloud(
             base.xyz, np.full(800, BACKGROUND), instances=instance_table(0, width=0), words=()
         ),
-        "instances without any descriptor": replace(base, instances=instance_table(9, [])),
+        "instances without any descriptor": replace(base, instances=replace(instance_table(9, []), points=base.counted_points)),
         "map coordinates": replace(base, origin=np.array([1e6, -4e6, 350.25])),
         "millimeters": make_cloud(base.xyz * 1000, base.instance_ids, 50.0, 150.0),
         "coincident points of different ids": make_cloud(twice, np.append(base.instance_ids, base.instance_ids[::-1])),

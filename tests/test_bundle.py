@@ -164,7 +164,7 @@ VECTORS = unit_rows(2).astype(np.float64)
     "change",
     [
         lambda cloud: replace(cloud, instance_ids=cloud.instance_ids.astype(np.int64)),
-        _of_table(points=np.arange(9), descriptors=unit_rows(9).astype(np.float16).astype(np.float64)),
+        _of_table(masks=np.arange(9), descriptors=unit_rows(9).astype(np.float16).astype(np.float64)),
         _of_table(agreement=np.ones(9), views=np.ones(9, np.uint8), descriptor_instance=np.arange(9)),
         _with_words(("mug", "cup"), VECTORS),
         _with_words(["mug", "cup"], VECTORS.astype(np.float16)),
@@ -174,7 +174,15 @@ def test_clouds_made_of_numpys_usual_types_are_written_as_files_that_open(tmp_pa
     cloud = change(room(300))
     scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
     assert og.segment(scene).labels.tolist() == og.segment(cloud).labels.tolist()
-    assert scene.cloud.instances.points.tolist() == cloud.instances.points.tolist()
+    assert scene.cloud.instances.masks.tolist() == cloud.instances.masks.tolist()
+
+
+def test_points_are_counted_when_a_cloud_of_fewer_points_is_written(tmp_path):
+    cloud = room(300)
+    half = replace(cloud, xyz=cloud.xyz[::2], instance_ids=cloud.instance_ids[::2], rgb=None, certainty=None)
+    assert half.instances.points.sum() > half.counted_points.sum()
+    instances = og.load(write_bundle(half, tmp_path / "s.ogpc")).cloud.instances
+    assert instances.points.tolist() == [int((half.instance_ids == k).sum()) for k in range(len(instances))]
 
 
 @pytest.mark.parametrize(
@@ -326,6 +334,7 @@ def say(*keys_and_value):
         (put("arrays/instance_ids.npy", npy_bytes(np.zeros(500, "<i8")).replace(b"'<i8'", b"'|O' ")), "Python objects"),
         (put("arrays/instance_ids.npy", npy_bytes(np.full(500, 9, np.int8))), "instance ids span 9..9"),
         (put("arrays/instance_ids.npy", npy_bytes(np.full(500, -3, np.int8))), "instance ids span -3..-3"),
+        (put("arrays/instances/points.npy", npy_bytes(np.full(9, 7, "<i4"))), "instance 0 has 7 points, its ids that"),
         *(
             (put(f"arrays/instances/{name}.npy", npy_bytes(np.array([5] * 8 + [value], kind))), f"{name} is {value}")
             for name, kind, value in (("views", "<i4", -1), ("masks", "<i4", -2), ("visible_area", "<f4", -1.0))

@@ -120,7 +120,10 @@ def test_a_graph_that_contradicts_the_arrays_is_found_out_on_opening(bundle, tmp
         forged(bundle, path, {"arrays/xyz.npy": npy_bytes(cloud.xyz[::-1].copy())})
     else:
         ids = np.where(cloud.instance_ids == 4, -1, cloud.instance_ids).astype(np.int8)
-        forged(bundle, path, {"arrays/instance_ids.npy": npy_bytes(ids)})
+        points = np.where(np.arange(9) == 4, 0, cloud.counted_points).astype(np.int32)
+        forged(
+            bundle, path, {"arrays/instance_ids.npy": npy_bytes(ids), "arrays/instances/points.npy": npy_bytes(points)}
+        )
     scene = og.load(path)  # the arrays may be looked at, as by `info`
     with pytest.raises(BundleError, match="contradicts the file's own points and ids"):
         og.segment([[0.5, 0.5, 0]], scene=scene)

@@ -93,6 +93,7 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
     """Members below arrays/, by name. Descriptors are stored only in query.onnx, at an offset in the manifest."""
     columns = [field.name for field in fields(InstanceTable) if field.name != "descriptors"]
     table = {INSTANCE_MEMBERS.get(name, name): getattr(cloud.instances, name) for name in columns}
+    table["points"] = cloud.counted_points  # where points were removed or copied, the table's may be of earlier ones
     if not np.isfinite(table["reliability"]).any():
         del table["reliability"]  # like files older than this column
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}

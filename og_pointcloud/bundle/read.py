@@ -62,7 +62,9 @@ def read_bundle(path: StrPath) -> Bundle:
         _check_members(manifest, members, carried)
         # Only complete, declared members are parsed, and each is checked against the others.
         # Absolute: what else the file holds is read later, perhaps from another working folder.
-        return Bundle(path.absolute(), _cloud(manifest, members), members["query.onnx"], manifest)
+        cloud = _cloud(manifest, members)
+        _check_counts(cloud)
+        return Bundle(path.absolute(), cloud, members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
 
@@ -195,6 +197,17 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
         )
     except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
         raise _Refused(f"its parts do not fit together ({error}): {ogpc.REBUILD}") from None
+
+
+def _check_counts(cloud: LabelledCloud) -> None:
+    """What lists and indices say of instances must be what their points say."""
+    wrong = np.flatnonzero(cloud.instances.points != cloud.counted_points)
+    if len(wrong):
+        first = int(wrong[0])
+        raise _Refused(
+            f"arrays/instances/points.npy says that instance {first} has {cloud.instances.points[first]} points, its "
+            f"ids that it has {cloud.counted_points[first]}: {ogpc.REBUILD}"
+        )
 
 
 def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) -> InstanceTable:
