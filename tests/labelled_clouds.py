@@ -86,7 +86,9 @@ def tough_clouds() -> dict[str, LabelledCloud]:
         "no instance, no words, no width": make_cloud(
             base.xyz, np.full(800, BACKGROUND), instances=instance_table(0, width=0), words=()
         ),
-        "instances without any descriptor": replace(base, instances=replace(instance_table(9, []), points=base.counted_points)),
+        "instances without any descriptor": replace(
+            base, instances=replace(instance_table(9, []), points=base.counted_points)
+        ),
         "map coordinates": replace(base, origin=np.array([1e6, -4e6, 350.25])),
         "millimeters": make_cloud(base.xyz * 1000, base.instance_ids, 50.0, 150.0),
         "coincident points of different ids": make_cloud(twice, np.append(base.instance_ids, base.instance_ids[::-1])),
