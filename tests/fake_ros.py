@@ -232,7 +232,7 @@ def install(monkeypatch):
         ),
         **message_package("std_msgs", "Header"),
         **message_package("builtin_interfaces", "Time"),
-        **message_package("sensor_msgs", "PointCloud2 PointField Image CameraInfo RegionOfInterest"),
+        **message_package("sensor_msgs", "PointCloud2 PointField Image CompressedImage CameraInfo RegionOfInterest"),
         "std_srvs": module("std_srvs"),
         "std_srvs.srv": module("std_srvs.srv", Trigger=SimpleNamespace(Request=object, Response=TriggerResponse)),
         **message_package("geometry_msgs", "Point Vector3 Quaternion Pose PoseWithCovariance"),

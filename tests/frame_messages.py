@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from og_pointcloud_ros import write_fields
+from og_pointcloud_ros.frames import DEPTH_HEADER
 from og_pointcloud_ros.messages import header
 from scipy.spatial.transform import Rotation
 
 SECOND = 1_000_000_000
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 
 
 def stamp_of(frame):
@@ -57,3 +60,22 @@ def messages_of(make, frame):
         "masks": image_message(make, (frame.masks + 1).astype(np.uint16), "16UC1", stamp),
         "features": write_fields(rows, "camera", stamp, messages=make),
     }  # fmt: skip
+
+
+def png(array):
+    return cv2.imencode(".png", array)[1].ravel()
+
+
+def compressed(make, message, form, data):
+    return make(COMPRESSED, header=message.header, format=form, data=data)
+
+
+def without_losses(make, frame):
+    """The messages of a frame as image_transport compresses them; colors as PNG, too."""
+    messages = messages_of(make, frame)
+    depth, masks = (1000 * frame.depth).round().astype(np.uint16), (frame.masks + 1).astype(np.uint16)
+    start = np.zeros(DEPTH_HEADER, np.uint8)
+    forms = {"depth": ("16UC1; compressedDepth png", np.r_[start, png(depth)]),
+             "masks": ("16UC1; png compressed ", png(masks)),
+             "color": ("rgb8; png compressed bgr8", png(frame.rgb[..., ::-1]))}  # fmt: skip
+    return messages | {role: compressed(make, messages[role], *form) for role, form in forms.items()}

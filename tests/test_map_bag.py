@@ -11,9 +11,19 @@ import pytest
 pytest.importorskip("rosbags")
 
 from commands import run
-from frame_messages import image_message, messages_of, place_of, stamp_of, transform
+from frame_messages import (
+    COMPRESSED,
+    compressed,
+    image_message,
+    messages_of,
+    place_of,
+    png,
+    stamp_of,
+    transform,
+    without_losses,
+)  # fmt: skip
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
-from og_pointcloud_ros.frames import DEPTH_HEADER, FrameAssembler, compressed_image_array
+from og_pointcloud_ros.frames import FrameAssembler, compressed_image_array
 from og_pointcloud_ros.map_bags import BagFrames
 from og_pointcloud_ros.messages import plain_messages
 from rosbags.rosbag2 import Writer
@@ -26,7 +36,6 @@ from og_pointcloud.errors import SceneError
 cv2 = pytest.importorskip("cv2")
 TOPICS = {"info": "/camera_info", "depth": "/depth/image_rect", "color": "/color/image_rect", "masks": "/masks",
           "features": "/mask_features"}  # fmt: skip
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
 KINDS = {"features": "sensor_msgs/msg/PointCloud2", "info": "sensor_msgs/msg/CameraInfo"}
 TWO_CAMERAS = {"back info": "/back/camera_info", "back color": "/back/image_rect", "info": "/front/camera_info",
                "depth": "/front/depth/image_rect", "masks": "/front/depth/masks", "features": "/front/features",
@@ -271,25 +280,6 @@ def test_what_a_bag_lacks_is_named(tmp_path, role):
     bag = write_bag(tmp_path / "drive", frames(THINGS)[:1], without=(TOPICS[role],))
     with pytest.raises(SceneError, match=f"has no {role}; expected "):
         BagFrames(bag)
-
-
-def png(array):
-    return cv2.imencode(".png", array)[1].ravel()
-
-
-def compressed(make, message, form, data):
-    return make(COMPRESSED, header=message.header, format=form, data=data)
-
-
-def without_losses(make, frame):
-    """The messages of a frame as image_transport compresses them; colors as PNG, too."""
-    messages = messages_of(make, frame)
-    depth, masks = (1000 * frame.depth).round().astype(np.uint16), (frame.masks + 1).astype(np.uint16)
-    start = np.zeros(DEPTH_HEADER, np.uint8)
-    forms = {"depth": ("16UC1; compressedDepth png", np.r_[start, png(depth)]),
-             "masks": ("16UC1; png compressed ", png(masks)),
-             "color": ("rgb8; png compressed bgr8", png(frame.rgb[..., ::-1]))}  # fmt: skip
-    return messages | {role: compressed(make, messages[role], *form) for role, form in forms.items()}
 
 
 OF_TRANSPORTS = TOPICS | {"depth": "/depth/image_rect/compressedDepth", "color": "/color/image_rect/compressed",

@@ -8,10 +8,11 @@ import pytest
 pytest.importorskip("rosbags")
 
 import fake_ros
-from frame_messages import messages_of, place_of, stamp_of
+from frame_messages import messages_of, place_of, stamp_of, without_losses
 from og_pointcloud_ros import ros_messages
 from visits import BIN, CHEST, CRATE, SPACE, frames, moved
 
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.mapping.frame_queue import FrameQueue
 
 BEFORE, AFTER = [CHEST, BIN, CRATE], [CHEST, BIN, moved(CRATE, (-0.9, 0.5, 0.0))]
@@ -24,11 +25,11 @@ def module(monkeypatch):
     return importlib.import_module("og_pointcloud_ros.map_node")
 
 
-def send(node, given, *, placed=True, without=()):
+def send(node, given, *, placed=True, without=(), messages=messages_of):
     for frame in given:
         if placed:
             node._transforms.tell("map", "camera", stamp_of(frame), *place_of(frame))
-        for role, message in messages_of(ros_messages, frame).items():
+        for role, message in messages(ros_messages, frame).items():
             if role not in without:
                 node.subscriptions[f"~/input/{role}"].callback(message)
 
@@ -63,6 +64,29 @@ def test_frames_become_objects_with_a_state(module):
     assert any(line == ("info", f"moved: {crate.id}") for line in node.logger.lines)
     node.destroy_node()
     assert node.destroyed
+
+
+def test_compressed_images_make_the_map_that_raw_ones_make(module):
+    raw = module.MapNode()
+    send(raw, frames(BEFORE)[:3])
+    fake_ros.Node.overrides["compressed"] = "depth, color,masks"
+    node = module.MapNode()
+    kinds = {name: subscription.kind.__name__ for name, subscription in node.subscriptions.items()}
+    assert [kinds[f"~/input/{role}"] for role in ("depth", "masks", "color", "features")] == [
+        "CompressedImage", "CompressedImage", "CompressedImage", "PointCloud2"
+    ]  # fmt: skip
+    send(node, frames(BEFORE)[:3], messages=without_losses)
+    one, other = (settled(each)._queue.mapper.snapshot().cloud for each in (raw, node))
+    assert len(one) > 0
+    for name in ("xyz", "instance_ids", "rgb"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert not warnings(node)
+
+
+def test_what_cannot_be_compressed_is_named(module):
+    fake_ros.Node.overrides["compressed"] = "depth,features"
+    with pytest.raises(OgPointcloudError, match="lists 'features'; expected one or more of depth, masks, color"):
+        module.MapNode()
 
 
 def test_the_map_is_saved_reset_and_loaded(module, tmp_path):

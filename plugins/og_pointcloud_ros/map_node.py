@@ -1,7 +1,8 @@
 """The ROS 2 node that maps: images with depth and masks in, objects with their state out. It needs ROS.
 
-Subscribes ~/input/depth, ~/input/masks, ~/input/color (sensor_msgs/Image), ~/input/features (PointCloud2) and
-~/input/info (CameraInfo), all as `frames` reads them; messages of one stamp are one frame, placed by tf at that stamp.
+Subscribes ~/input/depth, ~/input/masks, ~/input/color (sensor_msgs/Image, or CompressedImage for those that the
+parameter ``compressed`` lists), ~/input/features (PointCloud2) and ~/input/info (CameraInfo), all as `frames` reads
+them; messages of one stamp are one frame, placed by tf at that stamp.
 Publishes ~/objects (vision_msgs/Detection3DArray, latched) after each frame: ids, boxes, and as class id the state:
 present, moved, unseen or gone. Serves ~/save, ~/load and ~/reset (std_srvs/Trigger): the map to and from the file that
 the parameter ``map`` names, and an empty one.
@@ -19,7 +20,7 @@ from functools import partial
 from typing import Any
 
 from rclpy.qos import QoSReliabilityPolicy  # pyright: ignore[reportMissingImports]
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # pyright: ignore[reportMissingImports]
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2  # pyright: ignore[reportMissingImports]
 from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
 from tf2_ros import TransformException  # pyright: ignore[reportMissingImports]
 from vision_msgs.msg import Detection3DArray  # pyright: ignore[reportMissingImports]
@@ -32,7 +33,8 @@ from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.messages import ros_messages, time_message
 from og_pointcloud_ros.node import PlacedNode, error_text, latest_only, run
 
-PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "rectified": False, "max_age": 2.0}
+PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "rectified": False, "compressed": "",
+              "max_age": 2.0}  # fmt: skip
 """Parameters with their defaults; config/map.yaml explains them."""
 INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
 QUEUE_DEPTH = 10
@@ -44,11 +46,13 @@ class MapNode(PlacedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("og_pointcloud_map", PARAMETERS, **options)
+        compressed = _images_in(self._value("compressed"))
         self._assembler, self._arrived = FrameAssembler(rectified=self._value("rectified")), dict[int, float]()
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._objects = self.create_publisher(Detection3DArray, "~/objects", latest_only(reliable, latched=True))
         self._queue = FrameQueue(self._mapper(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
-        for role, kind in INPUTS.items():
+        for role, raw in INPUTS.items():
+            kind = CompressedImage if role in compressed else raw
             take = partial(self._on_message, role)
             self.create_subscription(kind, f"~/input/{role}", take, latest_only(best_effort, depth=QUEUE_DEPTH))
         for name, serve in {"save": self._save, "load": self._load, "reset": self._reset}.items():
@@ -133,6 +137,18 @@ class MapNode(PlacedNode):
         """Ends the queue first."""
         self._queue.close()
         super().destroy_node()
+
+
+def _images_in(listed: str) -> set[str]:
+    """The roles of images in a comma-separated list."""
+    images = [role for role, kind in INPUTS.items() if kind is Image]
+    roles = {role.strip() for role in listed.split(",")} - {""}
+    if unknown := sorted(roles.difference(images)):
+        raise OgPointcloudError(
+            f"the parameter 'compressed' lists '{unknown[0]}'; expected one or more of {', '.join(images)}, as in "
+            "--ros-args -p compressed:=depth,color"
+        )
+    return roles
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
