@@ -5,6 +5,7 @@
     python examples/zoo.py -o out/zoo --half choose --set membership.sure_share=0.5 --quick
     python examples/zoo.py -o out/zoo --half judge --worse views=5 poses=2  # from less (og_pointcloud_zoo/worse.py)
     python examples/zoo.py -o out/zoo --only desk room --needs           # from less and less of each, as a table
+    python examples/zoo.py -o out/zoo --captures CAPTURE [CAPTURE ...] --only NAME --largest-pieces
     python examples/zoo.py -o out/zoo --constants docs/constants.md      # each number at half and at twice its value
 
 Scenes are made once, in OUT/scenes. Each fit is listed with the best baseline of `og_pointcloud.evaluate.baselines`,
@@ -42,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--half", choices=tuple(HALVES), help="only this half")
     parser.add_argument("--set", nargs="+", default=[], metavar="PATH=VALUE", help="settings of the fit")
     parser.add_argument("--worse", nargs="+", default=[], metavar="KIND=AMOUNT", help=f"kinds: {', '.join(WAYS)}")
+    pieces = "score each thing at its largest piece: a truth voted by masks also names what is seen past its edges"
+    parser.add_argument("--largest-pieces", action="store_true", help=pieces)
     parser.add_argument("--needs", action="store_true", help="each kind by several amounts")
     parser.add_argument("--quick", action="store_true", help="without baselines")
     parser.add_argument("--constants", type=Path, metavar="PAGE", help="write the page of constants (--only: of some)")
@@ -96,7 +99,7 @@ def _rows(
         folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
         if not rows:
             warm_up(read_capture(folder))
-        rows.append(measure(folder, settings, baselines=not options.quick, changes=changes))
+        rows.append(measure(folder, settings, not options.quick, changes, options.largest_pieces))
         print(line(rows[-1]), flush=True)
         write_csv(rows, file)
     return rows

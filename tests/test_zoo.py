@@ -12,7 +12,7 @@ from og_pointcloud_room.raycast import Intrinsics
 from og_pointcloud_zoo import constants as numbers
 from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
-from og_pointcloud_zoo.measure import Row, measure, parsed_settings
+from og_pointcloud_zoo.measure import Row, at_largest_pieces, measure, parsed_settings
 from og_pointcloud_zoo.outdoors import Matched, Scanner, street_room
 from og_pointcloud_zoo.report import summary
 from og_pointcloud_zoo.worse import BLED_PX, COLOR_NOISE, COLORS, worse
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting import view_votes
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.rendering import sightings
@@ -131,6 +131,21 @@ def test_a_row_is_what_the_scorers_say(scenes, tmp_path, capsys):
     gain = [float(rows[0][key]) for key in ("gain_low", "gain", "gain_high")]
     assert gain == sorted(gain)
     assert gain[1] == pytest.approx(float(rows[0]["miou"]) - float(rows[0]["baseline_miou"]), abs=1e-9)
+
+
+def test_a_thing_is_scored_at_its_largest_piece_alone():
+    line = np.arange(10.0)
+    xyz = np.zeros((10, 3), np.float32)
+    xyz[:, 0] = np.where(line < 5, line, line + 20)  # two rows of five
+    cls = np.array([0, 0, 0, 1, 1, 1, 1, 0, -1, -1])
+    truth = Truth(cls, ("cup", "pot"), line != 1, cls < 0, np.where(cls < 0, -1, cls))
+    found = at_largest_pieces(truth, xyz, 0.5)
+    # The cup's point beyond the gap goes; of the pot's two pairs the first stays; what was not scored stays so.
+    assert found.scored.tolist() == [True, False, True, True, True, False, False, False, True, True]
+    assert found.cls is truth.cls
+    assert at_largest_pieces(truth, xyz, 10).scored.tolist() == truth.scored.tolist()
+    with pytest.raises(OgPointcloudError, match="no 'instance'"):
+        at_largest_pieces(replace(truth, instance=None), xyz, 0.5)
 
 
 def test_settings_are_changed_by_path():

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 import og_pointcloud as og
@@ -32,6 +34,8 @@ from og_pointcloud_zoo.draws import half_of
 from og_pointcloud_zoo.worse import worse
 
 WORDS, BANK = "text_features.npz", "word_bank.npz"
+PIECE_SPACINGS = 5.0
+"""Points of a thing that are no farther apart than so many point spacings belong to one piece of it."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,17 @@ class Row:
 
 
 def measure(
-    folder: Path, settings: FitSettings | None = None, baselines: bool = True, changes: Mapping[str, Any] | None = None
+    folder: Path,
+    settings: FitSettings | None = None,
+    baselines: bool = True,
+    changes: Mapping[str, Any] | None = None,
+    largest_pieces: bool = False,
 ) -> Row:
     """Fit and score a capture with gt.npz and text_features.npz, and the baselines on the same mask table.
 
     changes: kind -> amount by which the capture is made worse before the fit (`worse`). It is scored at all its points:
     those that were left out take the label of the nearest one that was not.
+    largest_pieces: score each thing at its largest piece alone (`at_largest_pieces`).
     """
     capture, truth, changes = read_capture(folder), read_truth(folder), changes or {}
     scene = capture
@@ -86,6 +95,7 @@ def measure(
     at = np.asarray(cKDTree(scene.points.xyz).query(xyz)[1]) if "points" in changes else np.arange(len(xyz))
     at_points = replace(cloud, xyz=xyz, instance_ids=cloud.instance_ids[at], rgb=None, certainty=None)
     answer = answered(folder, at_points, truth)
+    truth = at_largest_pieces(truth, answer.xyz, answer.spacing) if largest_pieces else truth
     score = truth.score(answer.called)
     recall, precision = _of_instances(at_points.instance_ids, truth)
     row = Row(
@@ -104,6 +114,24 @@ def measure(
         worse=" ".join(f"{kind}={amount}" for kind, amount in changes.items()),
     )
     return _beside_baselines(row, folder, prepared, at, answer, truth, score.classes) if baselines else row
+
+
+def at_largest_pieces(truth: Truth, xyz: NDArray[np.float32], spacing: float) -> Truth:
+    """The truth, with the points of a thing that lie apart from its largest piece not scored.
+
+    A vote of masks, read at the pixels of points, also names points seen past a thing's edges, on the wall behind it.
+    OgPointcloudError where the truth has no things.
+    """
+    if truth.instance is None:
+        raise OgPointcloudError("gt.npz has no 'instance'; expected one, the thing that each point is part of")
+    scored, named = truth.scored.copy(), truth.cls >= 0
+    for thing in np.unique(truth.instance[named]):
+        points = np.flatnonzero(named & (truth.instance == thing))
+        near = cKDTree(xyz[points]).query_pairs(PIECE_SPACINGS * spacing, output_type="ndarray").T
+        graph = csr_array((np.ones(near.shape[1]), near), shape=(len(points), len(points)))
+        piece = connected_components(graph, directed=False)[1]
+        scored[points] &= piece == np.bincount(piece).argmax()
+    return replace(truth, scored=scored)
 
 
 def _of_instances(ids: NDArray[np.int32], truth: Truth) -> tuple[float | None, float | None]:
