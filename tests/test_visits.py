@@ -481,6 +481,21 @@ def test_a_visit_adds_its_words_and_a_carried_text_encoder_stays(tiny_capture, t
     assert read_carried_encoder(mapper.save(tmp_path / "later.ogpc")) == read_carried_encoder(before)
 
 
+def test_a_map_that_is_written_over_keeps_its_text_encoder(tiny_capture, tmp_path):
+    folder, file = tiny_capture.folder, tmp_path / "room.ogpc"
+    assert main(["fit", str(folder), "-o", str(file)]) == 0
+    width = og.load(file).cloud.instances.descriptors.shape[1]
+    carry_encoder(file, write_files(tmp_path / "encoder", encoder_files(FEATURE_SPACE, width)))
+    carried = read_carried_encoder(file)
+    mapper, capture = og.Mapper(file), og.read_capture(folder)
+    for view in capture.views:
+        camera = in_local_frame(view.camera, -capture.points.origin)
+        mapper.integrate(og.Frame(camera, view.mask_map(), view.mask_features))
+    assert read_carried_encoder(mapper.save(file)) == carried is not None
+    file.unlink()  # the map in memory is still saved
+    assert len(og.load(mapper.save(file)).xyz) == len(mapper.snapshot().xyz)
+
+
 def test_a_map_without_points_is_refused(monday):
     none = replace(monday, xyz=monday.xyz[:0], instance_ids=monday.instance_ids[:0], rgb=None, certainty=None)
     for pair in ((none, monday), (monday, none)):

@@ -158,10 +158,11 @@ def carry_encoder(path: StrPath, folder: StrPath, output: StrPath | None = None)
     return encoder
 
 
-def keep_encoder(path: StrPath, earlier: StrPath | None) -> None:
-    """Store the text encoder of an earlier .ogpc, if it carries one, in the .ogpc that was made from it."""
-    if earlier is not None and read_carried_encoder(earlier):
-        carry_encoder(path, earlier)
+def carrier_of_encoder(path: StrPath | None) -> StrPath | None:
+    """The path of a .ogpc that carries a text encoder, for ``write_bundle``; None if it carries none or is gone."""
+    # Asked before what is made from it is written: that may be the same file.
+    carries = path is not None and Path(path).is_file() and read_carried_encoder(path)
+    return path if carries else None
 
 
 def carried_encoder(path: StrPath | None) -> CarriedEncoder:

@@ -24,6 +24,7 @@ from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
+    from og_pointcloud.formats.atomic import StrPath
     from og_pointcloud.scene import Points
 
 SHOWN = 12
@@ -273,10 +274,13 @@ def interruptible() -> Iterator[None]:
         raise
 
 
-def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:
+def write_fit(
+    cloud: LabelledCloud, journal: Journal, output: Path, text_encoder: StrPath | None = None
+) -> LabelledCloud:
     """Write the .ogpc file; returns the cloud with the journal's stages and the writing stage added to its provenance.
 
-    OgPointcloudError if the file cannot be written; it says where the cloud was saved instead.
+    text_encoder: as for ``write_bundle``. OgPointcloudError if the file cannot be written; it says where the cloud was
+    saved instead.
     """
     from og_pointcloud_export import write_bundle
 
@@ -286,12 +290,12 @@ def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledC
     cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
     with Journal(False, stages).stage("write file"):
         try:
-            write_bundle(cloud, output)
+            write_bundle(cloud, output, text_encoder=text_encoder)
         except OSError as error:
             # A fit may have taken hours: it is saved where there is room, if anywhere.
             kept = Path(tempfile.mkdtemp(prefix="og-pointcloud-", dir=scratch_root())) / output.name
             try:
-                write_bundle(cloud, kept)
+                write_bundle(cloud, kept, text_encoder=text_encoder)
             except OSError:
                 kept.parent.rmdir()
                 raise error from None

@@ -30,15 +30,14 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
-    from og_pointcloud.bundle.vocabulary import keep_encoder
+    from og_pointcloud.bundle.vocabulary import carrier_of_encoder
     from og_pointcloud.mapping.merging import update
 
     before = load(arguments.map)
     journal = Journal(progress=False)
     with journal.stage("update"):
         updated = update(before, arguments.capture, gaussians=arguments.gaussians)
-    write_fit(updated.cloud, journal, arguments.output)
-    keep_encoder(arguments.output, arguments.map)
+    write_fit(updated.cloud, journal, arguments.output, carrier_of_encoder(arguments.map))
     if arguments.json:
         write_json(arguments.json, updated.changes.to_dict())
     print_changes(updated.changes)

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
-from og_pointcloud.bundle.vocabulary import keep_encoder
+from og_pointcloud.bundle.vocabulary import carrier_of_encoder
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.points import read_points
@@ -274,9 +274,8 @@ class Mapper:
         """Write the snapshot as .ogpc, whole or not at all, with the text encoder that the continued map has."""
         from importlib import import_module
 
-        written = import_module("og_pointcloud_export").write_bundle(self.snapshot().cloud, path)
-        keep_encoder(written, self._base_file)
-        return written
+        cloud, carrier = self.snapshot().cloud, carrier_of_encoder(self._base_file)
+        return import_module("og_pointcloud_export").write_bundle(cloud, path, text_encoder=carrier)
 
     def correct(self, poses: Mapping[float, ArrayLike]) -> None:
         """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world
