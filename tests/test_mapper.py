@@ -119,6 +119,22 @@ def test_what_left_is_said_to_have_stood_where_all_of_it_did():
     assert np.abs(gone.box.center - (np.array(high.low) + np.array(high.size) / 2)).max() < 0.1
 
 
+def test_frames_of_before_do_not_bring_back_what_has_left_since():
+    """They come late, through another queue, say: what they add was seen through in later frames."""
+    mapper, _ = mapped(frames(THINGS))
+    crate = instance_of(mapper.snapshot().cloud, CRATE)
+    for frame in frames([CHEST, BIN], seed=1, first=100.0):
+        mapper.integrate(frame)
+    points, last_seen = mapper.points, {entry.id: entry.last_seen for entry in mapper.objects()}
+    changes = [mapper.integrate(frame) for frame in frames(THINGS, seed=2, first=50.0)]
+    assert all(change.new == change.moved == () for change in changes)
+    assert instance_of(mapper.snapshot().cloud, CRATE) == -1
+    assert mapper.points < 1.01 * points
+    assert {entry.id: entry.last_seen for entry in mapper.objects()} == last_seen
+    changes = [mapper.integrate(frame) for frame in frames(THINGS, seed=3, first=200.0)]
+    assert [entry.id for change in changes for entry in change.moved] == [crate]
+
+
 def test_a_missed_detection_removes_nothing():
     mapper, _ = mapped(frames(THINGS))
     blind = [replace(frame, masks=None, features=None, stamp=50.0 + k) for k, frame in enumerate(frames(THINGS))]

@@ -120,7 +120,9 @@ class GrowingMap:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
             row, column = pixel // camera.width, pixel % camera.width
             rgb = frame.rgb[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
-        if points.add(xyz.astype(np.float32), rgb, len(self.anchors)):
+        # A late frame cannot bring back what has left since.
+        closed = ~points.alive & (self.presence.seen_at[:before] > frame.stamp)
+        if points.add(xyz.astype(np.float32), rgb, len(self.anchors), closed):
             self.anchors.append((frame.stamp, frame.camera.world_to_camera))
         added = np.arange(before, points.n, dtype=np.int32)
         self.grow()

@@ -72,14 +72,15 @@ def remove_points(map_: GrowingMap, died: NDArray[np.int32], stamp: float) -> li
         lost = [row for row in track.lost if map_.points.weight[row] == 0]
         track.losing_since = track.losing_since if lost else stamp
         track.lost = lost + died[owners == k].tolist()
-        if track.id >= 0 and len(track.lost) >= MIN_POINTS and _has_left(map_, k):
+        if track.id >= 0 and len(track.lost) >= MIN_POINTS and _has_left(map_, k, stamp):
             gone.append(track.id)
     map_.forget(died)
     return sorted(gone)
 
 
-def _has_left(map_: GrowingMap, k: int) -> bool:
-    """Whether most of a track's visible points left; then the others leave too, except those measured since."""
+def _has_left(map_: GrowingMap, k: int, stamp: float) -> bool:
+    """Whether most of a track's visible points left; then the others leave too, at that stamp, except those measured
+    since."""
     track, rows = map_.tracks.tracks[k], map_.rows_of(k)
     # Most of the points looked at since the first loss must be lost: points that no frame has looked at since are no
     # sign that the object is still there. And it must be a fair share of all points: a small part is not the whole.
@@ -92,7 +93,8 @@ def _has_left(map_: GrowingMap, k: int) -> bool:
     leaving = np.setdiff1d(rows, still)
     gone = np.append(np.array(track.lost, np.int32), leaving)
     track.left, track.left_at, track.lost = _look(map_, k, gone), track.sequence, []
-    map_.points.weight[leaving] = 0
+    map_.points.weight[leaving], seen_at = 0, map_.presence.seen_at
+    seen_at[leaving] = np.maximum(seen_at[leaving], stamp)  # a late frame must not bring them back
     map_.forget(rows)
     return True
 

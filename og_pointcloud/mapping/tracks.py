@@ -68,7 +68,7 @@ class PointVotes(Columns):
 class Track:
     """total: (D,) sum of its masks' unit features, weighted by the points that each mask shows; pixels: sum of these
     weights. views, masks: number that showed it. first, sequence: numbers of the first and last frame that did, 0 for
-    an earlier map; last_seen: stamp of the last. id: of the object, NO_TRACK while provisional. home: (3,)
+    an earlier map; last_seen: their latest stamp. id: of the object, NO_TRACK while provisional. home: (3,)
     where it stood before it first left, world coordinates, None for what never came back. box: (2, 3) lowest and
     highest coordinates of points that voted for it. lost: rows of its points removed as seen through; losing_since:
     stamp of the first of these. left: its look, once most were removed; left_at: the frame that last showed it:
@@ -78,7 +78,7 @@ class Track:
     pixels: float = 0.0
     views: int = 0
     masks: int = 0
-    last_seen: float = 0.0
+    last_seen: float = -np.inf
     sequence: int = 0
     first: int = 0
     id: int = NO_TRACK
@@ -272,7 +272,8 @@ class Tracks:
                 track.total = of_masks[m] * unit[m] + (0 if track.total is None else track.total)
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
             track.first = track.first if track.masks > 1 else when[1]
-            track.views, (track.last_seen, track.sequence) = track.views + 1, when
+            track.views, track.sequence = track.views + 1, when[1]
+            track.last_seen = max(track.last_seen, when[0])  # frames may come late
             if track.id < 0 and track.views >= MIN_VIEWS:
                 new.append(k)
             elif track.id >= 0:

@@ -168,11 +168,15 @@ class VoxelPoints(Columns):
         self.reindex()
         return np.argsort(order) + rows.start
 
-    def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> bool:
+    def add(
+        self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int, closed: NDArray[np.bool_] | None = None
+    ) -> bool:
         """Add measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new ones.
-        Returns whether any point is now of this frame: a new one, or one where others had left."""
+        Returns whether any point is now of this frame: a new one, or one where others had left. closed: (n,) rows that
+        take no readings; None: all do."""
+        closed = np.zeros(self.n, np.bool_) if closed is None else closed
         self._reserve(len(xyz))
-        voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
+        voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor, closed)
         self.n, brought = _insert(xyz, rgb, anchor, self.edge, voxels, points, self.n)
         self.packets.add(self.xyz)
         return brought
@@ -251,7 +255,7 @@ def _index(new_keys, new_rows, keys, rows):  # noqa: ANN001, ANN202
 def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
     """Number of points after the insertion, and whether any is of this frame. All readings of a point lie in its voxel,
     and so does their mean: its key does not change."""
-    (keys, rows), (xyz, rgb, weight, anchor) = voxels, points
+    (keys, rows), (xyz, rgb, weight, anchor, closed) = voxels, points
     brought = False
     for i in range(len(new)):
         key = _key(new[i, 0], new[i, 1], new[i, 2], edge)
@@ -264,6 +268,8 @@ def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
         # A running mean; with bounded weight it becomes an exponential moving one. Weight 1 is a point that had left (0
         # before): it starts again at the reading.
         row = rows[slot]
+        if row < len(closed) and closed[row]:
+            continue
         weight[row] = min(weight[row] + 1, MAX_READINGS)
         if weight[row] == 1:
             anchor[row], brought = frame, True
