@@ -241,18 +241,19 @@ def test_time_reversed_swaps_gone_and_new(monday, friday):
     assert [moved.id for moved in changes.moved] == [instance_of(friday, AFTER[1])]
 
 
+def scaled(cloud, unit):
+    poses = [camera.world_to_camera.copy() for camera in cloud.cameras]
+    for pose in poses:
+        pose[:3, 3] *= unit
+    views = (replace(camera, world_to_camera=pose) for camera, pose in zip(cloud.cameras, poses, strict=True))
+    lengths = {"spacing": unit * cloud.spacing, "reach": unit * cloud.reach}
+    return replace(cloud, xyz=(unit * cloud.xyz).astype(np.float32), cameras=tuple(views), **lengths)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
 def test_the_unit_of_length_does_not_matter(monday, friday, unit):
-    def scaled(cloud):
-        poses = [camera.world_to_camera.copy() for camera in cloud.cameras]
-        for pose in poses:
-            pose[:3, 3] *= unit
-        views = (replace(camera, world_to_camera=pose) for camera, pose in zip(cloud.cameras, poses, strict=True))
-        lengths = {"spacing": unit * cloud.spacing, "reach": unit * cloud.reach}
-        return replace(cloud, xyz=(unit * cloud.xyz).astype(np.float32), cameras=tuple(views), **lengths)
-
-    one, other = og.compare(monday, friday), og.compare(scaled(monday), scaled(friday))
+    one, other = og.compare(monday, friday), og.compare(scaled(monday, unit), scaled(friday, unit))
     assert (one.gone, one.new) == (other.gone, other.new)
     assert [(m.id, m.now) for m in one.moved] == [(m.id, m.now) for m in other.moved]
 
@@ -435,6 +436,13 @@ def test_another_place_is_refused(monday, friday):
     with pytest.warns(UserWarning, match="looks at none of the earlier visit's .* points: they do not overlap") as said:
         og.compare(monday, below)
     assert (len(said), said[0].filename) == (1, __file__)
+
+
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
+def test_a_visit_in_another_unit_is_refused(monday, unit):
+    """Meters and millimeters, with one origin: to the coarser of the two, all of the other lies at one place."""
+    with pytest.raises(SceneError, match=r"all points of the (earlier|later) visit lie within .* different units"):
+        og.compare(monday, scaled(monday, unit))
 
 
 def test_a_visit_that_seems_to_move_most_things_is_doubted(monday):

@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
-from og_pointcloud.cloud import BACKGROUND
+from og_pointcloud.cloud import BACKGROUND, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.journal import with_bar
 from og_pointcloud.mapping.likeness import (
@@ -155,6 +155,7 @@ def compare_visits(
     missing = np.zeros(len(a))  # depth images lack no points
     # What the later views say about both; where frames were judged one by one, the map has counted it already.
     if again is None:
+        _require_one_unit(a, b)
         views = with_bar(later.measured(), "now", len(b.cameras), progress and later.depth is None)
         still_there, own = Presence.from_views(views, tolerance, a.xyz, b.xyz)
         _require_one_frame(still_there)
@@ -180,6 +181,18 @@ def _warn_of_many_changes(changes: Changes, things: int) -> None:
             "two are not in the same world frame: register their poses first",
             stacklevel=4,
         )
+
+
+def _require_one_unit(a: LabelledCloud, b: LabelledCloud) -> None:
+    """SceneError where all points of one visit lie closer together than the other's neighbors: within what is tolerated
+    as noise, so that every one of them would count as measured again."""
+    for coarse, fine, which in ((b, a, "earlier"), (a, b, "later")):
+        extent = float(np.linalg.norm(fine.xyz.max(axis=0).astype(np.float64) - fine.xyz.min(axis=0)))
+        if 0 < extent < coarse.spacing:  # 0: of a single point
+            raise SceneError(
+                f"all points of the {which} visit lie within {extent:.3g}, the other's are {coarse.spacing:.3g} apart: "
+                "the two seem to be in different units of length: scale one of them"
+            )
 
 
 def _require_one_frame(now: Presence) -> None:
