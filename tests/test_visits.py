@@ -370,7 +370,9 @@ def test_a_map_keeps_its_ids(monday, updated):
     assert updated.changes.new[0] >= len(monday.instances)
     bin_ = instance_of(monday, BIN)
     assert cloud.instances.points[bin_] == 0
-    assert bin_ in MapRecord.of(cloud).gone
+    record = MapRecord.of(cloud)
+    assert bin_ in record.gone
+    assert [record.last_seen[k] for k in (bin_, instance_of(monday, CHEST))] == [0.0, 1.0]
     assert instance_of(cloud, BIN) == -1
 
 

@@ -30,7 +30,7 @@ class VisitEntry:
 
 @dataclass
 class MapRecord:
-    """visits: in order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by id,
+    """visits: in order. last_seen: by id, the stamp of the visit that last saw the instance. moved_from: by id,
     its place before its last move. gone: by id, the look of instances that left and have not come back; their
     descriptors are not stored twice, as the table still has them."""
 

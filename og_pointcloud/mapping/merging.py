@@ -231,16 +231,18 @@ def _descriptors(
 def _record_visit(
     record: MapRecord, earlier: Visit, found: Comparison, ids_of_later: NDArray[np.int64], entry: VisitEntry
 ) -> None:
-    """Record what the visit saw. An instance that it did not look at keeps the time when it was last seen."""
+    """Record what the visit saw. An instance that it did not look at, or that has left, keeps the time when it was last
+    seen."""
     record.visits.append(entry)
-    looked_at = earlier.count(found.evidence.still) >= MIN_POINTS
-    looked_at[list(found.changes.unseen)] = False
-    for k in {*np.flatnonzero(looked_at).tolist(), *ids_of_later.tolist()}:
+    # Smaller pieces of what moved become rows without points too: the thing keeps the id of its largest piece.
+    left = {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}
+    seen = earlier.count(found.evidence.still) >= MIN_POINTS
+    seen[[*found.changes.unseen, *left]] = False  # of what left, some points lie on what stands there still
+    for k in {*np.flatnonzero(seen).tolist(), *ids_of_later.tolist()}:
         record.last_seen[k] = entry.stamp
     for moved in found.changes.moved:
         record.moved_from[moved.id] = tuple(moved.before.tolist())
     for k in found.back.values():
         del record.gone[k]
-    # Smaller pieces of what moved become rows without points too: the thing keeps the id of its largest piece.
-    for k in {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}:
+    for k in left:
         record.gone[k] = earlier.look(k, earlier.rows[k])
