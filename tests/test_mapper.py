@@ -154,6 +154,22 @@ def test_a_map_is_gone_on_with():
     assert instance_of(cloud, CHEST) == instance_of(before, CHEST)
 
 
+def test_what_comes_into_a_map_that_goes_on_has_one_id(grown, tmp_path):
+    came = [PARCEL, Thing((-1.1, 0.9, 0.0), (0.3, 0.3, 0.7), (240, 240, 240), 5),
+            Thing((1.0, -0.2, 0.0), (0.35, 0.35, 0.45), (120, 60, 160), 6)]  # fmt: skip
+    before, given = grown[0].snapshot(), frames([CHEST, CRATE, *came], seed=1, first=100.0)
+    mapper, changes = mapped(given, before, journal=tmp_path / "map")
+    cloud, objects = mapper.snapshot().cloud, {entry.id: entry for entry in mapper.objects()}
+    new = [instance_of(cloud, thing) for thing in came]
+    for thing, known in zip(came, new, strict=True):
+        assert np.abs(objects[known].place - (np.array(thing.low) + np.array(thing.size) / 2)).max() < 0.3
+    assert mapper.changes.new == tuple(sorted(new)) == changes[1].new
+    assert mapper._map.tracks.next_id == len(cloud.instances)
+    np.testing.assert_array_equal(
+        og.Mapper(before, journal=tmp_path / "map").snapshot().instance_ids, cloud.instance_ids
+    )
+
+
 def test_more_loops_of_one_path_keep_no_more():
     """Each place is kept from one direction a few times at most; here that is full after the second loop."""
     mapper, _ = mapped(frames(THINGS))
@@ -647,10 +663,15 @@ def test_points_that_came_are_labelled_by_their_own_neighbors(monkeypatch):
     known.points.add((known.points.edge * came).astype(np.float32), np.zeros((lacking, 3), np.uint8), 0)
     known.grow()
     known.presence.seen_at[known.points.n - lacking : known.points.n] = 0.0
-    module, given = sys.modules["og_pointcloud.mapping.mapper"], []
-    monkeypatch.setattr(module, "labelled", lambda *arguments: given.append(arguments))
-    monkeypatch.setattr(og.Mapper, "_folded", lambda *arguments: None)
-    mapper._label(known)
+    given = []
+
+    def asked(*arguments):
+        given.append(arguments)
+        raise InterruptedError  # what would follow is not looked at
+
+    monkeypatch.setattr(sys.modules["og_pointcloud.mapping.mapper"], "labelled", asked)
+    with pytest.raises(InterruptedError):
+        mapper._label(known)
     ((_, rows, around, settings),) = given
     assert len(rows) == len(mapper._rows) > lacking > 0
     np.testing.assert_array_equal(around.index, neighborhood(known.points.xyz[rows], settings.geometry).index)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
@@ -330,26 +330,28 @@ class Mapper:
         rows = rows[there[rows]]
         if around is None or not np.array_equal(rows, self._rows):  # the same number may be other points
             around = neighborhood(map_.points.xyz[rows], self.settings.geometry)
-        count, wanted = map_.tracks.next_id, np.zeros(0, np.int64)
-        before = count, map_.scale, map_.drawn
+        before = map_.tracks.next_id, map_.scale, map_.drawn
         visit = labelled(map_, rows, around, self.settings)
-        if self._base is None:
-            id_of_track = np.array([*(track.id for track in map_.tracks.tracks), -1], np.int32)
-            known = id_of_track[map_.owners()[rows]]
-            wanted, count = matched_ids(visit.instance_ids, len(visit.instances), known, count)
-        chosen = count, map_.scale, map_.drawn
+        id_of_track = np.array([*(track.id for track in map_.tracks.tracks), -1], np.int32)
+        known = id_of_track[map_.owners()[rows]]
+        wanted, count = matched_ids(visit.instance_ids, len(visit.instances), known, map_.tracks.next_id)
+        cloud = with_ids(visit, wanted, count) if self._base is None else self._folded(self._base, visit, map_, wanted)
+        chosen = max(map_.tracks.next_id, len(cloud.instances)), map_.scale, map_.drawn
         if self._journal is not None and chosen != before:
             self._journal.append(map_.sequence, chosen)
-        map_.tracks.next_id = count
-        return with_ids(visit, wanted, count) if self._base is None else self._folded(self._base, visit, map_)
+        map_.tracks.next_id = chosen[0]
+        return cloud
 
-    def _folded(self, base: LabelledCloud, visit: LabelledCloud, map_: GrowingMap) -> LabelledCloud:
-        """The map that the mapper continues, with this visit merged in."""
+    def _folded(
+        self, base: LabelledCloud, visit: LabelledCloud, map_: GrowingMap, wanted: NDArray[np.int64]
+    ) -> LabelledCloud:
+        """The map that the mapper continues, with this visit merged in. wanted: from `matched_ids`."""
         alive, presence = map_.points.alive[self._rows], map_.presence
         again = alive & presence.present[self._rows], ~alive | presence.absent[self._rows]  # measured; seen through
         earlier, later = Visit(base), Visit(visit)
         found = compare_visits(earlier, later, again)
-        updated = merge(earlier, later, found, "frames", map_.stamp)
+        given = np.where(wanted < map_.tracks.next_id, wanted, -1)  # those of objects; others may not need one
+        updated = merge(earlier, later, found, "frames", map_.stamp, (given, map_.tracks.next_id))
         self._changes = updated.changes
         return updated.cloud
 

@@ -81,11 +81,16 @@ def update(
     return merge(earlier, later, compare_visits(earlier, later, progress=progress), capture.name)
 
 
-def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: float | None = None) -> Updated:
-    """The map after a visit. stamp: of the visit; None: one more than the last one's."""
+def merge(
+    earlier: Visit, later: Visit, found: Comparison, name: str, stamp: float | None = None,
+    given: tuple[NDArray[np.int64], int] | None = None,
+) -> Updated:  # fmt: skip
+    """The map after a visit. stamp: of the visit; None: one more than the last one's. given: (later instances,) ids
+    beyond the map's that they have already, below that none, and the next id after all that were given."""
     a, b = earlier.cloud, later.cloud
     stays, orphaned = _staying(earlier, found)
-    ids_of_later = _ids_of_later(earlier, later, stays, found)
+    given = (np.full(len(b.instances), -1), len(a.instances)) if given is None else given
+    ids_of_later = _ids_of_later(earlier, later, stays, found, given)
     # Only those points of the visit are added that lie where the map has none (left): visits do not densify the map.
     adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_POINT_SPACINGS * a.spacing
     states = np.append(ids_of_later, [UNOBSERVED, BACKGROUND])  # -2 and -1 index the last two
@@ -128,10 +133,13 @@ def _staying(earlier: Visit, found: Comparison) -> tuple[NDArray[np.bool_], NDAr
     return (~through | unseen[ids]) & (~left[ids] | still), left[ids] & still
 
 
-def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:
+def _ids_of_later(
+    earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison, given: tuple[NDArray[np.int64], int]
+) -> NDArray[np.int64]:
     """(later instances,) their ids in the map: the old id for what moved or is back, a fresh one for what came, the id
-    of most of its surface for what was there already, and a fresh one too for what the map did not know."""
-    count = fresh = len(earlier.cloud.instances)
+    of most of its surface for what was there already, and a fresh one too for what the map did not know. given: as for
+    `merge`; such an id counts as a fresh one."""
+    count, (own, fresh) = len(earlier.cloud.instances), given
     on_map = (found.nearest >= 0) & stays[found.nearest]
     owners = earlier.cloud.instance_ids[found.nearest]
     on_none = np.where(owners == BACKGROUND, count, owners)  # gets its own column
@@ -145,7 +153,9 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
         thing = found.pieces.get(k)
         if thing is not None:
             map_ids[k] = came.get(thing, -1)
-        if map_ids[k] < 0:
+        if map_ids[k] < 0 and own[k] >= count:
+            map_ids[k] = own[k]
+        elif map_ids[k] < 0:
             map_ids[k], fresh = fresh, fresh + 1
         if thing is not None:
             came[thing] = int(map_ids[k])
