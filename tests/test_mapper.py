@@ -281,6 +281,17 @@ def test_a_pose_that_float32_rounded_is_told():
         og.Mapper(feature_space=SPACE).integrate(replace(frame, camera=rounded))
 
 
+def test_a_frame_farther_off_than_voxels_are_counted_is_refused():
+    """As by a robot that begins at 0 and then gets its place in UTM: all its readings would share one voxel."""
+    given = frames(THINGS)
+    mapper, _ = mapped(given[:4], spacing=0.04)
+    points, far = mapper.points, og.in_world(given[4].camera, (431234.5, 5412345.6, 312.3))
+    with pytest.raises(SceneError, match=r"frame 4 stands 5\.41e\+06 from where the map began; .* at most 4\.19e\+04"):
+        mapper.integrate(replace(given[4], camera=far))
+    assert mapper.points == points
+    mapper.integrate(given[4])
+
+
 def test_a_camera_close_to_a_wall_is_of_the_place():
     """Most of the map before it lies behind the wall."""
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)))

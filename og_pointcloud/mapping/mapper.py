@@ -39,6 +39,7 @@ from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
+from og_pointcloud.mapping.voxels import MAX_VOXEL_INDEX
 from og_pointcloud.rendering.geometry import Neighborhood, neighborhood
 from og_pointcloud.scene import Camera, Points, require_finite, rounded_pose
 from og_pointcloud.settings import FitSettings, fit_settings
@@ -316,6 +317,12 @@ class Mapper:
             pixel = valid.view.pixel * valid.view.camera.fx / valid.camera.fx
             spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, valid.view.pixel)
             map_ = GrowingMap.empty(origin, self._space, spacing)
+        away, reach = float(np.abs(valid.camera.center).max()), MAX_VOXEL_INDEX * map_.points.edge
+        if map_.points.grows and away > reach:  # all that it measures would be in one voxel
+            raise SceneError(
+                f"frame {valid.stamp:.15g} stands {away:.3g} from where the map began; expected at most {reach:.3g}: "
+                "its pose is in another world frame, or begin another map there"
+            )
         if frame.camera is not None and (coarse := rounded_pose(frame.camera.world_to_camera, map_.points.edge)):
             warnings.warn(f"frames may be placed wrongly; {coarse}", stacklevel=3)
         return valid, map_
