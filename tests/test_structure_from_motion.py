@@ -118,9 +118,12 @@ def test_photographs_that_share_nothing_say_what_to_do(tmp_path, capsys):
 
 
 def test_too_few_photographs_and_a_missing_library(tmp_path, monkeypatch):
-    with pytest.raises(SceneError, match="has 0 photographs; expected 3 or more"):
+    with pytest.raises(SceneError, match="none is not a folder; expected one of photographs"):
         find_poses(tmp_path / "none")
-    for index in range(3):
+    write_image(tmp_path / "plan.png", np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"has 1 photograph; expected 3 or more, there or in its images/"):
+        find_poses(tmp_path)
+    for index in range(3):  # the plan beside images/ is none of the photographs
         write_image(tmp_path / "images" / f"{index}.png", np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "other" / "images").mkdir(parents=True)
     with pytest.raises(SceneError, match=r"images has other images than .*name another folder"):
@@ -130,7 +133,7 @@ def test_too_few_photographs_and_a_missing_library(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(MissingExtraError, match="poses"):
         find_poses(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["images"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "plan.png"]
 
 
 @pytest.mark.parametrize("count", [3, MAX_EXHAUSTIVE, MAX_EXHAUSTIVE + 1, 1000])

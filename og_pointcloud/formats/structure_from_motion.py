@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from og_pointcloud.errors import SceneError, naming_extra
+from og_pointcloud.errors import SceneError, counted, naming_extra
 from og_pointcloud.formats.atomic import StrPath, replacing_folder
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import numbered_images, upright_axes
@@ -99,9 +99,14 @@ def find_poses(
 
 def _photographs(source: Path, target: Path) -> list[Path]:
     """The files, in the order of their numbers; SceneError where they cannot become a capture in the target."""
-    files = numbered_images(source) or numbered_images(source / "images")
+    if not source.is_dir():
+        raise SceneError(f"{source} is not a folder; expected one of photographs")
+    files = numbered_images(source)
+    if len(files) < MIN_SIZE:  # a plan or a preview may lie beside images/
+        files = numbered_images(source / "images") or files
     if len(files) < MIN_SIZE:
-        raise SceneError(f"{source} has {len(files)} photographs; expected {MIN_SIZE} or more, there or in its images/")
+        found = counted(len(files), "photograph")
+        raise SceneError(f"{source} has {found}; expected {MIN_SIZE} or more, there or in its images/")
     if os.path.lexists(target / MODEL_FOLDER):
         raise SceneError(f"{target / MODEL_FOLDER} already exists; expected none: remove it, or name another folder")
     images = target / "images"
