@@ -66,6 +66,12 @@ def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
     assert "none.ogpc is not a file" in error_of(capsys, "eval", "capture", fitted / "tiny", fitted / "none.ogpc")
     np.savez(tmp_path / "bare/gt.npz", names=np.array(NAMES), cls=np.zeros(3, int))
     assert "points, the truth 3; expected the truth's points" in error_of(capsys, *bare)
+    cloud = og.load(fitted / "S.ogpc").cloud
+    og.write_bundle(replace(cloud, vocabulary=None), tmp_path / "wordless.ogpc")
+    np.savez(tmp_path / "bare/gt.npz", names=np.array(NAMES), cls=np.zeros(len(cloud), int))
+    said = error_of(capsys, "eval", "capture", tmp_path / "bare", tmp_path / "wordless.ogpc")
+    assert "wordless.ogpc has no words; expected the capture's text_features.npz" in said
+    assert "--labels" not in said, "this command has no such option"
 
 
 def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path, capsys):

@@ -47,13 +47,18 @@ class CaptureScore:
 
 def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> Answer:
     """Label a scene with the names of text_features, or with all of its own words. SceneError where its points are not
-    those of the truth."""
+    those of the truth, or where it has no words."""
     scene = as_scene(scene)
     cloud = scene.cloud
     if len(cloud) != len(truth.cls):
         raise SceneError(
             f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected the truth's points in the "
             "same order: fit the capture's own cloud, without --gaussians, or write gt.npz for this file's points"
+        )
+    if text_features is None and not (scene.vocabulary and scene.vocabulary.names):
+        raise SceneError(
+            f"{scene.path} has no words; expected the capture's text_features.npz, --text-features F.npz, or words in "
+            "the file (og-pointcloud vocabulary add)"
         )
     result = segment(scene, None, text_features=text_features)
     return Answer(truth.class_of(result.labels, result.names), result.instances, cloud.xyz, cloud.spacing)
