@@ -14,8 +14,8 @@
     og.select(scene, "red mug")                         # instances ranked by a word
     og.edit.remove(scene, "red mug", "without.ply", cloud="kitchen.ply")
 
-Importing costs little: each name is fetched from its module on first use, and only ``fit``, what reads captures and
-results, what writes bundles and what draws pictures need more than numpy and onnxruntime (the extra 'fit').
+Importing costs little: each name is fetched from its module on first use. Only what fits, maps, compares, reads images
+and other programs' results, writes bundles or draws pictures needs more than numpy and onnxruntime (the extra 'fit').
 """
 
 from __future__ import annotations
