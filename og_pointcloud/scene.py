@@ -421,6 +421,13 @@ def evenly(items: Sequence[Item], count: int) -> list[Item]:
     return [items[row] for row in np.unique(rows)]
 
 
+def middle_extent(xyz: NDArray[np.floating]) -> float:
+    """The longest side of the box around the middle 90 % of finite points (n, 3), n >= 1, along each axis: a stray at
+    the origin of a map is a thousand kilometers from the place."""
+    low, high = np.quantile(xyz, [0.05, 0.95], axis=0)
+    return float((high - low).max())
+
+
 def float32_step(xyz_world: NDArray[np.floating]) -> float:
     """Spacing of float32 numbers at the median magnitude of finite points (n, 3), if all their coordinates are float32
     numbers, as in a map that a program stored as float32; else 0."""

@@ -119,10 +119,14 @@ def test_points_at_one_place_have_no_coordinates_to_doubt():
         assert _coordinates(points) == []
 
 
-def test_map_coordinates_that_float32_rounded_are_a_doubt():
-    """A right cloud, and its cameras, of which a program has kept the cloud's coordinates as float32."""
+@pytest.mark.parametrize("stray", [False, True])
+def test_map_coordinates_that_float32_rounded_are_a_doubt(stray):
+    """A right cloud, and its cameras, of which a program has kept the cloud's coordinates as float32; also with a point
+    at the origin of the map, where scanners put what they did not measure."""
     room = tiled_room(2, origin=(431234.567, 5412345.678, 312.0))
-    rounded = Points.from_world(room.points.xyz_world.astype(np.float32), rgb=room.points.rgb)
+    xyz = room.points.xyz_world.astype(np.float32)
+    xyz[0] *= not stray
+    rounded = Points.from_world(xyz, rgb=room.points.rgb)
     found = doubts(with_cameras(replace(room, points=rounded), lambda cameras: cameras))["coordinates"]
     assert "in steps of 0.5 at 5412347.0" in found.says
 

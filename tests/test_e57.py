@@ -94,6 +94,15 @@ def test_points_that_the_scanner_calls_invalid_are_left_out(tmp_path):
     np.testing.assert_allclose(points.xyz_world[:, 0], data["cartesianX"][np.arange(300) % 3 != 0], atol=1e-6)
 
 
+def test_a_stray_far_from_the_scan_costs_the_others_no_millimeters(tmp_path):
+    """As a point at the origin of the map is, where some programs put what a scanner did not measure."""
+    data, at = scan(), np.array([431234.567, 5412345.678, 312.0])
+    data["cartesianY"][-1] = -at[1]
+    write_e57(tmp_path / "a.e57", [data], turn=STRAIGHT, at=at)
+    world = np.column_stack([data[f"cartesian{axis}"] for axis in "XYZ"]) + at
+    np.testing.assert_allclose(read_points(tmp_path / "a.e57").xyz_world[:-1], world[:-1], rtol=0, atol=1e-5)
+
+
 class Measured(np.ndarray):
     """An array whose bounds, which the writer stores, are those of its finite values."""
 

@@ -172,6 +172,14 @@ def test_a_row_with_nan_makes_no_doubles_of_the_others(tmp_path):
     np.testing.assert_array_equal(np.isnan(rows["x"]), np.arange(30) == 3)
 
 
+def test_a_stray_at_the_origin_of_the_map_costs_the_others_no_millimeters(tmp_path):
+    """Scanners write 0 0 0 for what they did not measure: 5000 km from the place, by which float32 seemed precise."""
+    xyz = np.vstack([XYZ + np.array([431234.567, 5412345.678, 312]), np.zeros((1, 3))])
+    write_labelled_ply(tmp_path / "a.ply", xyz, RGB[[*range(30), 0]], labels_of(31))
+    rows = read_ply(tmp_path / "a.ply")["vertex"]
+    np.testing.assert_array_equal(np.column_stack([rows[axis] for axis in "xyz"]), xyz)
+
+
 def test_positions_beyond_float32_are_stored_as_double(tmp_path):
     xyz = np.array([[0, 0, 0], [1e300, 1, 2]])
     write_labelled_ply(tmp_path / "a.ply", xyz, RGB[:2], labels_of(2))

@@ -21,7 +21,7 @@ from og_pointcloud.checking.registration import GROUPS, MORE_POINTS_PER_VIEW, Re
 from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import coordinate, printable
-from og_pointcloud.scene import Points, Scene, float32_step
+from og_pointcloud.scene import Points, Scene, float32_step, middle_extent
 
 Verdict = Literal["ok", "doubt", "unchecked"]
 
@@ -156,7 +156,7 @@ def _doubt(name: str, says: str, repairs: Repairs = (), then: str = "") -> Check
 def _coordinates(points: Points) -> list[Check]:
     """A doubt where float32 rounded a map's coordinates to steps larger than the distance between its points."""
     # A surface of n points is about sqrt(n) times as wide as the distance between them.
-    pitch = float(np.ptp(points.xyz, axis=0).max()) / float(np.sqrt(len(points)))
+    pitch = middle_extent(points.xyz) / float(np.sqrt(len(points)))
     farthest = float(np.abs(points.origin).max())
     if pitch == 0 or np.spacing(np.float32(farthest)) <= pitch or (step := float32_step(points.xyz_world)) <= pitch:
         return []

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.scene import middle_extent
 
 SCALE_8_TO_16_BITS = 257
 """Scales an 8-bit color to the range of 16 bits."""
@@ -142,7 +143,8 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
 
 
 def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:
-    """Positions as float32, or as float64 where float32 would move a point by more than 1e-6 of the cloud's extent."""
+    """Positions as float32, or as float64 where float32 would move a point by more than 1e-6 of the cloud's extent
+    without strays (`middle_extent`)."""
     world = np.asarray(xyz_world, np.float64)
     with np.errstate(over="ignore"):
         single = world.astype(np.float32)
@@ -152,7 +154,7 @@ def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:
         # Not a number, as a depth camera marks what it did not measure, is the same in both.
         placed = np.isfinite(world).all(axis=1)
         loss = np.abs(single[placed].astype(np.float64) - world[placed]).max(initial=0)
-        extent = np.ptp(world[placed], axis=0).max() if placed.any() else 0.0
+        extent = middle_extent(world[placed]) if placed.any() else 0.0
     return single if loss <= 1e-6 * extent else world
 
 
