@@ -138,6 +138,20 @@ def test_an_instance_chosen_of_the_scene_before_lights_nothing(live, page):
         assert live.lit is None
 
 
+def test_a_stray_at_the_origin_of_the_map_moves_no_point_of_the_page(pages):
+    """The page's origin was half way to it, where the browser's float32 has steps of 25 cm, and near was 500 m away."""
+    cloud = room(300)
+    strayed = np.vstack([cloud.xyz, np.float32([[-4e5, -5.4e6, -300]])])
+    ids, origin = np.append(cloud.instance_ids, -1), np.array([4e5, 5.4e6, 300])
+    moved = replace(cloud, xyz=strayed, origin=origin, instance_ids=ids, rgb=None, certainty=None)
+    page = pages.serve({"room": LiveScene(og.LabelledScene.from_cloud(moved))}, pages.ServeSettings(port=0))
+    try:
+        assert np.abs(page._middle - origin).max() < 10
+        assert page._server.initial_camera.near < 0.01
+    finally:
+        page.stop()
+
+
 def test_a_notebook_shows_the_page_in_its_cell(pages):
     page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
     try:

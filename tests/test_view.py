@@ -33,6 +33,18 @@ def content(page):
     return data
 
 
+def test_a_stray_at_the_origin_of_the_map_moves_no_point_of_the_page(tmp_path, capsys):
+    """It made each step of a place 80 m long: all points of a room fell into one."""
+    cloud = room()
+    xyz = np.vstack([cloud.xyz, np.float32([[-4e5, -5.4e6, -300]])])
+    strayed = {"xyz": xyz, "origin": np.array([4e5, 5.4e6, 300]), "instance_ids": np.append(cloud.instance_ids, -1)}
+    write_bundle(replace(cloud, **strayed, rgb=None, certainty=None), tmp_path / "a.ogpc")
+    assert "left out of the page: 1 of" in output_of(capsys, "view", tmp_path / "a.ogpc", "--instances", "--cut", "0.5")
+    data = content(tmp_path / "a.html")
+    place = data["place"].reshape(-1, 3) / 65535 * data["size"] + data["low"]
+    assert np.allclose(np.ptp(place, axis=0), np.ptp(cloud.xyz, axis=0), atol=1e-3)
+
+
 def test_the_page_holds_what_segment_answers(bundle, tmp_path, capsys):
     page = tmp_path / "new folder" / "room.html"
     stdout = output_of(capsys, "view", bundle, "--labels", "plum,apple", "--html", page, "--boxes", "--cut", "0.25")

@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from og_pointcloud.cli.segment import describe_segmentation, print_segmentation
     from og_pointcloud.show.page import Look, write_page
-    from og_pointcloud.show.viewpoint import choose_viewpoint
+    from og_pointcloud.show.viewpoint import are_no_strays, choose_viewpoint
 
     up = np.array(common.direction(arguments.up or "z"), np.float64)  # fails before the work, if invalid
     journal = Journal(progress=False)
@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no points to show; expected at least one")
+    shown[shown] = are_no_strays(result.xyz[shown])
     height = result.xyz[shown] @ up  # the view is chosen for the points left by --cut, as when the page opens
     shown[shown] = height <= height.max() - arguments.cut * np.ptp(height)
     view = choose_viewpoint(result.xyz[shown], result.labels[shown] >= 0, up)

@@ -23,7 +23,7 @@ from og_pointcloud.errors import OgPointcloudError, coordinate, counted
 from og_pointcloud.formats.atomic import StrPath, write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import MAX_WORDS_SHOWN, meaning, meaning_of
-from og_pointcloud.show.viewpoint import Viewpoint
+from og_pointcloud.show.viewpoint import Viewpoint, are_no_strays
 
 TEMPLATE = Path(__file__).with_name("page.html")
 MAX_POINTS = 2_000_000
@@ -66,6 +66,7 @@ def write_page(
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:
         raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected at least one")
+    finite = finite[are_no_strays(result.xyz[finite])]  # the steps of places span all that is shown
     shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MAX_POINTS)).astype(np.int64)]
     left_out = [f"{len(result) - len(shown):,} of {len(result):,} points"] if len(shown) < len(result) else []
     words, word_data = _words(scene)

@@ -23,7 +23,7 @@ from og_pointcloud.ask.boxes import unit_up
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.show.live import Answer, LiveScene
 from og_pointcloud.show.screen import Screen
-from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
+from og_pointcloud.show.viewpoint import FOCAL, are_no_strays, choose_viewpoint
 
 LOOPBACK, PORT, PORT_COUNT = "127.0.0.1", 8080, 1 << 16
 HEIGHT_PX = 640
@@ -214,7 +214,8 @@ class LivePage:
     def _show_scene(self) -> None:
         """Put the scene's points, camera and lists into the page."""
         live = self._live
-        low, high = live.xyz.min(axis=0), live.xyz.max(axis=0)
+        placed = live.xyz[are_no_strays(live.xyz)]
+        low, high = placed.min(axis=0), placed.max(axis=0)
         self._middle = low + (high - low) / 2  # the page's origin
         view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, unit_up(self._settings.up))
         camera = self._server.initial_camera

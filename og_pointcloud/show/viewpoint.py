@@ -19,6 +19,9 @@ GRID_PX = (96, 60)
 MAX_SAMPLE_POINTS = 20_000
 TRIM_PERCENTILES = (3.0, 97.0)
 """Percentiles of the points that the frame must contain: strays should not make everything small."""
+STRAY_SIDES = 10.0
+"""Points farther from these percentiles than this many of their longest sides are strays, such as 0 0 0 in a map: a
+picture with them shows nothing else."""
 EYE_DISTANCE_HALF_DIAGONALS = 1.6
 """Distance of the eye while directions are compared, in half diagonals of the points."""
 FILLED_SHARE = 0.9
@@ -67,6 +70,13 @@ def choose_viewpoint(xyz: DoubleArray, labelled: NDArray[np.bool_], up: DoubleAr
     inside = ((points >= low) & (points <= high)).all(axis=1)
     # Each of a few points may be the outermost along some axis: then all count.
     return _framed(points[inside] if inside.any() else points, best)
+
+
+def are_no_strays(xyz: DoubleArray) -> NDArray[np.bool_]:
+    """(n,) bool, which finite points (n, 3), n >= 1, are not far from all others; all if most are at one place."""
+    low, high = np.percentile(xyz, TRIM_PERCENTILES, axis=0)
+    margin = STRAY_SIDES * float((high - low).max()) or np.inf
+    return ((xyz >= low - margin) & (xyz <= high + margin)).all(axis=1)
 
 
 def _framed(points: DoubleArray, view: Viewpoint) -> Viewpoint:
