@@ -91,7 +91,7 @@ def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, conte
     path = tmp_path / "a.ply"
     path.write_bytes(content)
     with pytest.raises(
-        SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* PCD .* LAZ, COPC, E57 or SPZ"
+        SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* PCD .* LAZ, COPC, E57, SPZ or SOG"
     ) as caught:
         read_points(path)
     assert str(caught.value).startswith(f"{path}: ")

@@ -28,6 +28,8 @@ from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
 from hostile_files import SEEDS, UNKNOWN_GRAPHS, with_graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
+from test_formats_sog import packed as packed_sog
+from test_formats_sog import written as written_sog
 from test_formats_spz import splats
 
 from og_pointcloud.bundle.read import read_bundle
@@ -112,6 +114,10 @@ def _spz(folder: Path) -> list[bytes]:
     write_spz(folder / "made.spz", splats(12))
     raw = gzip.decompress((folder / "made.spz").read_bytes())
     return [(folder / "made.spz").read_bytes(), gzip.compress(raw, compresslevel=0)]  # of the second, damage is read
+
+
+def _sog(folder: Path) -> list[bytes]:
+    return [written_sog(folder / "made.sog", *packed_sog(splats(12))).read_bytes()]
 
 
 def _images_bin(folder: Path) -> list[bytes]:
@@ -234,6 +240,7 @@ READERS: dict[str, tuple[Callable | bytes, Callable]] = {
     "cloud.ply": (_ply, lambda path: [read_points(path).xyz]),
     "cloud.pcd": (_pcd, lambda path: [read_points(path).xyz]),
     "splats.spz": (_spz, lambda path: [read_points(path).xyz]),
+    "splats.sog": (_sog, lambda path: [read_points(path).xyz]),
     "cloud.las": (_las, lambda path: [read_points(path).xyz]),
     "cloud.copc.laz": (_copc, lambda path: [read_points(path).xyz]),
     "images.bin": (_images_bin, _read_images_bin),
@@ -274,7 +281,7 @@ def first_files(name: str, folder: Path) -> list[bytes]:
 
 
 DOCUMENTED = {
-    "PLY": ["cloud.ply"], "PCD": ["cloud.pcd"], "E57": ["scan.e57"], "SPZ": ["splats.spz"],
+    "PLY": ["cloud.ply"], "PCD": ["cloud.pcd"], "E57": ["scan.e57"], "SPZ": ["splats.spz"], "SOG": ["splats.sog"],
     "LAS, LAZ, COPC": ["cloud.las", "cloud.copc.laz"], "COLMAP's `.bin`": ["images.bin", "points3D.bin"],
     "nerfstudio's, Polycam's, 3D Scanner App's JSON": ["transforms.json", "polycam.json", "scanner_app.json"],
     "ARKitScenes' `.traj`, KITTI-360's poses": ["lowres_wide.traj", "cam0_to_world.txt"],

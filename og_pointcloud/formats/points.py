@@ -18,19 +18,21 @@ from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
 from og_pointcloud.formats.las import read_las
 from og_pointcloud.formats.pcd import looks_like_pcd, read_pcd
 from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
+from og_pointcloud.formats.sog import looks_like_sog, read_sog
 from og_pointcloud.formats.spz import looks_like_spz, read_spz
 from og_pointcloud.formats.tables import colors, naming, positions
 from og_pointcloud.scene import Points
 
 
 def read_points(path: StrPath) -> Points:
-    """Read a plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's PLY, SPZ), whatever the name.
+    """Read a plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's PLY, SPZ, SOG), whatever the
+    name.
 
     World coordinates are read as float64; their median becomes the origin. Colors are uint8 RGB, None where the
     file has none. Points of a plain cloud that hold NaN or infinity, as depth cameras write them, are left out with a
     warning.
     SceneError, beginning with the path, for a file that cannot be read or has no points, and for Gaussians that hold
-    NaN. LAS and LAZ need the extra 'las', E57 'e57', SPZ version 4 'spz'.
+    NaN. LAS and LAZ need the extra 'las', E57 'e57', SPZ version 4 'spz', SOG 'fit'.
 
     >>> import pathlib, tempfile
     >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
@@ -98,10 +100,12 @@ def _read(path: Path) -> Points | NDArray[np.void]:
         return read_e57(path)
     if looks_like_spz(head):
         return read_spz(path)
+    if looks_like_sog(head):
+        return read_sog(path)
     start = f"it starts with {head[:16]!r}" if head else "it is empty"
     raise SceneError(
         f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-        "compressed), PCD (ascii, binary, binary_compressed), LAS, LAZ, COPC, E57 or SPZ file: convert it first"
+        "compressed), PCD (ascii, binary, binary_compressed), LAS, LAZ, COPC, E57, SPZ or SOG file: convert it first"
     )
 
 
