@@ -327,6 +327,17 @@ def test_broken_annotation_files(tmp_path, text):
         ExistingMasks(tmp_path).of("a", (9, 9))
 
 
+def test_numbers_beyond_floats(tmp_path):
+    """A score of 10^400 counts as 1, as any other above; a corner there is outside of everything."""
+    square, huge = [1, 1, 5, 1, 5, 5], 10**400
+    scored = [{"segmentation": [square], "size": [9, 9], "score": score} for score in (huge, -huge)]
+    (tmp_path / "a.json").write_text(json.dumps(scored))
+    assert ExistingMasks(tmp_path).of("a", (9, 9)).scores.tolist() == [1, 0]
+    (tmp_path / "b.json").write_text(json.dumps([{"segmentation": [[huge, *square[1:]]], "size": [9, 9]}]))
+    with pytest.raises(SceneError, match="annotation 0: a polygon is "):
+        ExistingMasks(tmp_path).of("b", (9, 9))
+
+
 def test_a_color_png_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
     with pytest.raises(SceneError, match=r"8-bit RGB .*expected an 8-bit or 16-bit gray PNG"):

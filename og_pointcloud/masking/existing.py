@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import runpy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -272,7 +273,9 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Pro
             raise SceneError(f"{where} is {masks[-1].shape}, the first {masks[0].shape}; expected masks of one image")
         _check_room(len(masks), masks[0].shape, source)
         score = annotation.get("score", annotation.get("predicted_iou", 1.0))
-        scores.append(float(np.clip(score, 0, 1)) if isinstance(score, (int, float)) and np.isfinite(score) else 1.0)
+        # Not numpy's functions, which refuse whole numbers beyond 64 bits.
+        finite = isinstance(score, (int, float)) and abs(score) < math.inf
+        scores.append(float(min(max(score, 0), 1)) if finite else 1.0)
     return Proposals(np.array(masks), np.array(scores, np.float32)) if masks else None
 
 
@@ -282,7 +285,7 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
     for ring in polygons:
         try:
             corners = np.array(ring, np.float64).reshape(-1, 2)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             corners = np.empty((0, 2))
         if len(corners) < 3 or not (np.abs(corners) < 1e6).all():
             raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y, ... of at least three corners")
