@@ -312,6 +312,8 @@ def test_poses_in_millimeters_with_depth_in_meters_are_doubted(tmp_path):
     [
         (write_scannet, "pose/0.txt", "1 2 3", r"shape \(1, 3\); expected rows of 4"),
         (write_scannet, "pose/0.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1", "differs from a rotation"),
+        (write_scannet, "pose/0.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n2 3 4 1", r"last row is .*2.0, 3.0, 4.0, 1.0"),
+        (write_replica, "traj.txt", "1 0 0 0 0 1 0 0 0 0 1 0 2 3 4 1\n" * 6, "traj.txt, line 1: the pose's last row"),
         (write_scannet, "pose/0.txt", "1 0 0 0\n", r"shape \(1, 4\); expected a 4x4 matrix"),
         (write_scannet, "intrinsic/intrinsic_color.txt", "a b", "cannot be read as rows of numbers"),
         (write_scannet, "intrinsic/intrinsic_depth.txt", "1 0 0 0", "expected a 4x4 matrix"),

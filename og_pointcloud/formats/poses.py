@@ -25,6 +25,8 @@ from og_pointcloud.scene import Camera, DoubleArray
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 MAX_NUMBER = 1e30
 """Larger numbers in a pose file mean that it is damaged. Squares of smaller ones are finite."""
+LAST_ROW_TOLERANCE = 1e-3
+"""Of a 4x4 pose: exporters round it."""
 OPENGL_SIGNS = np.array([1.0, -1.0, -1.0, 1.0])
 """Factors of a camera-to-world pose's columns, between OpenGL's axes (y up, z back) and OpenCV's."""
 
@@ -81,6 +83,11 @@ class Sensor:
         """The camera at a pose; camera_to_world: (3 or 4, 4), finite, OpenCV axes."""
         if camera_to_world.shape not in ((3, 4), (4, 4)):
             raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
+        # A transposed matrix has a rotation too, but its translation is in this row, and would be lost.
+        if len(camera_to_world) == 4 and np.abs(camera_to_world[3] - [0, 0, 0, 1]).max() > LAST_ROW_TOLERANCE:
+            raise SceneError(
+                f"the pose's last row is {camera_to_world[3].tolist()}; expected [0, 0, 0, 1]: is it transposed?"
+            )
         return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, inverse(camera_to_world))
 
 
