@@ -38,6 +38,7 @@ from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudErr
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.las import write_las
+from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.photogrammetry import read_photogrammetry
@@ -523,6 +524,15 @@ def test_long_names_do_not_make_long_messages(folder, tmp_path):
         with pytest.raises(BundleError) as caught:
             read_bundle(path)
         assert len(str(caught.value)) < LONGEST_MESSAGE + len(str(path))
+
+
+@pytest.mark.parametrize("kind", [b"IDAT", b"tEXt"])
+def test_a_chunk_of_a_png_that_claims_more_than_the_file(tmp_path, kind):
+    """OpenCV would allocate and fill what it claims: a gigabyte for a hundred bytes."""
+    data = PICTURE[:33] + struct.pack(">I", 1 << 30) + kind + PICTURE[33:]
+    (tmp_path / "mask.png").write_bytes(data)
+    with pytest.raises(SceneError, match=rf"mask.png .*a chunk of 1073741824 bytes has {len(data) - 41} left"):
+        read_ids(tmp_path / "mask.png")
 
 
 @pytest.mark.parametrize(

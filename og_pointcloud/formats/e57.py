@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, naming_extra
 from og_pointcloud.formats.atomic import StrPath, write_file, write_json
-from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
+from og_pointcloud.formats.images import MAX_PIXELS, decoded_bytes, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import MAX_NUMBER, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
@@ -238,11 +238,9 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
         turn, rise = np.degrees([width * across, height * along])
         raise SceneError(f"it spans {turn:.0f} x {rise:.0f} degrees; expected 360 across, and 180 at most")
     cv2 = require_cv2()
-    pixels = None
-    if stated_size(io.BytesIO(data), "its image") == size:  # a small file may unpack to gigabytes
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
+    if stated_size(io.BytesIO(data), "its image") != size:  # a small file may unpack to gigabytes
         raise SceneError("its JPEG or PNG is damaged, or its size is not the one the file states")
+    pixels = np.asarray(decoded_bytes(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR, "its image"))
     # The sphere is twice as wide as high; the image takes its part of the height, in the middle.
     whole = width // 2 * 2, width // 2
     shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))

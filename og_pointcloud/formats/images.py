@@ -6,6 +6,7 @@ import io
 import os
 import posixpath
 import re
+import struct
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from types import ModuleType
@@ -24,6 +25,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".t
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 LEADS_OUT = re.compile(r"/|\.\.(?:/|$)|[A-Za-z]:/")
 """Beginnings of normalized paths that lead out of a folder, also on Windows."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
 
@@ -86,7 +88,7 @@ def png_header(file: Path) -> PngHeader | None:
     """Size and pixel type from a PNG's first 26 bytes; None if the file is no PNG."""
     with file.open("rb") as stream:
         head = stream.read(26)
-    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+    if len(head) < 26 or not head.startswith(PNG_SIGNATURE) or head[12:16] != b"IHDR":
         return None
     header = PngHeader(int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"), head[24], head[25])
     _check_pixels(file, header.width, header.height)
@@ -164,8 +166,9 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
 
 def decoded_bytes(data: NDArray[np.uint8], flags: int, name: Path | str) -> NDArray[np.generic]:
     """As `decoded`, of an image file's bytes. SceneError, which begins with ``name``, where they are none."""
-    cv2 = require_cv2()
-    stated_size(io.BytesIO(data.tobytes()), name)  # refuses too many pixels before OpenCV allocates them
+    cv2, content = require_cv2(), data.tobytes()
+    stated_size(io.BytesIO(content), name)  # refuses too many pixels before OpenCV allocates them
+    _check_chunks(content, name)
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except cv2.error:
@@ -173,6 +176,16 @@ def decoded_bytes(data: NDArray[np.uint8], flags: int, name: Path | str) -> NDAr
     if pixels is None:
         raise _undecodable(name, data.size)
     return pixels
+
+
+def _check_chunks(content: bytes, name: Path | str) -> None:
+    """SceneError where a chunk of a PNG claims more bytes than follow: OpenCV allocates and fills what it claims."""
+    at = len(PNG_SIGNATURE)
+    while content.startswith(PNG_SIGNATURE) and at + 8 <= len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        if length > (left := len(content) - at - 8):
+            raise _undecodable(name, len(content), f" (a chunk of {length} bytes has {left} left)")
+        at += 12 + length if kind != b"IEND" else len(content)  # what follows the last chunk is not read
 
 
 def palette_indices(file: Path) -> NDArray[np.uint8]:
@@ -184,8 +197,10 @@ def palette_indices(file: Path) -> NDArray[np.uint8]:
         raise _undecodable(file, file.stat().st_size) from None
 
 
-def _undecodable(name: Path | str, size: int) -> SceneError:
-    return SceneError(f"{name} ({size} bytes) cannot be decoded as an image: it is damaged or truncated, copy it again")
+def _undecodable(name: Path | str, size: int, why: str = "") -> SceneError:
+    return SceneError(
+        f"{name} ({size} bytes) cannot be decoded as an image: it is damaged or truncated{why}, copy it again"
+    )
 
 
 def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
