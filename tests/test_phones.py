@@ -142,6 +142,17 @@ def test_intrinsics_of_arkit_scenes_may_be_named_a_millisecond_off(tmp_path, sta
 
 
 @pytest.mark.filterwarnings("ignore:.*no finite pose")
+def test_a_time_of_arkit_scenes_that_is_no_number_is_no_frames_time(tmp_path):
+    """NaN was the nearest of all times: every image got its pose."""
+    write_arkit_scenes(tmp_path)
+    before = [image.camera for image in read_poses(tmp_path).images]
+    with (tmp_path / "lowres_wide.traj").open("a") as stream:
+        stream.write("nan 0 0 0 7 8 9\n")
+    after = [image.camera for image in read_poses(tmp_path).images]
+    np.testing.assert_array_equal([a.world_to_camera for a in after], [b.world_to_camera for b in before])
+
+
+@pytest.mark.filterwarnings("ignore:.*no finite pose")
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b"1 2 3", b'{"fx": "x", "intrinsics": [1], "t_00": null}', b"\xff\xfe"]
 )

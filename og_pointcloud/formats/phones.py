@@ -95,6 +95,7 @@ def _is_arkit_scenes(folder: Path) -> bool:
 
 def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
     rows = read_numbers(folder / "lowres_wide.traj", 7)
+    rows = rows[np.isfinite(rows[:, 0])]  # NaN would be nearest to every time
     rows = rows[np.argsort(rows[:, 0])]
     for file in numbered_images(folder / "lowres_wide"):
         path, lens = f"lowres_wide/{file.name}", folder / "lowres_wide_intrinsics" / f"{file.stem}.pincam"
@@ -103,7 +104,7 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
             stamps = [f"{float(time[1]) + shift:.3f}" for shift in PINCAM_SHIFTS_S]
             beside = [lens.with_name(f"{file.stem[: time.start(1)]}{stamp}.pincam") for stamp in stamps]
             lens = next((other for other in beside if other.is_file()), lens)
-        nearest = rows[np.abs(rows[:, 0] - float(time[1])).argmin()] if time else None
+        nearest = rows[np.abs(rows[:, 0] - float(time[1])).argmin()] if time and len(rows) else None
         if nearest is None or time is None or not lens.is_file() or abs(nearest[0] - float(time[1])) > MAX_OFFSET_S:
             yield RecordedFrame(path, lens)
             continue
