@@ -449,6 +449,10 @@ NO_GRAY = "; expected an 8-bit or 16-bit gray PNG"
             r"has no masks at all; expected masks/<image stem>.png .*language_features",
         ),
         (
+            posed(lambda content: content["frames"][1].update(file_path="images/" + "long" * 100)),
+            r"1 of 3 posed images have no mask: .*lacks longlong.{60,80}; expected .*all-zero mask",
+        ),
+        (
             without("masks/frame_01.png"),
             r"1 of 3 posed images have no mask: .*lacks frame_01.png; .*all-zero mask",
         ),

@@ -590,6 +590,13 @@ def test_a_pose_file_that_is_not_read_need_not_make_sense(tmp_path):
     assert len(read_capture(tmp_path / "half").views) == 2
 
 
+def test_a_record_that_is_nested_without_end_is_none(tmp_path):
+    make_capture(tmp_path)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "made.json").write_text("[" * 200_000)
+    assert make_masks(tmp_path, QUICK, progress=False).masks > 0
+
+
 @pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
 def test_turns_by_exif_are_those_of_pillow(tmp_path, orientation):
     file, exif = tmp_path / "a.jpg", Image.Exif()

@@ -23,6 +23,7 @@ Masks set the resolution: a camera takes the size of its mask map (shapes must a
 
 from __future__ import annotations
 
+import os
 import posixpath
 import warnings
 from collections.abc import Callable, Sequence
@@ -241,7 +242,8 @@ def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
 
 def _has_mask(capture: Path, name: str) -> bool:
     files = f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy"
-    return any((capture / file).is_file() for file in files)
+    # Not Path.is_file, which fails for names that are too long.
+    return any(os.path.isfile(capture / file) for file in files)
 
 
 def _layers(

@@ -8,6 +8,7 @@ second as half floats.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,8 +98,9 @@ def lengths(stored: NDArray, unit: float | None = None) -> NDArray[np.float32]:
 
 def find_depth(capture: Path, name: str) -> Path | None:
     """The depth image of the view called ``name``: ``depth/<name>.png`` and the like, or None."""
+    # os.path.isfile: Path.is_file fails for names that are too long.
     files = (capture / folder / f"{name}{suffix}" for folder in DEPTH_FOLDERS for suffix in DEPTH_SUFFIXES)
-    return next((file for file in files if file.is_file()), None)
+    return next((file for file in files if os.path.isfile(file)), None)
 
 
 def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:

@@ -9,6 +9,7 @@ in all views, -1 unknown.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import SceneError, printable
 from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
 from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.formats.poses import read_json_object
@@ -78,10 +79,10 @@ def made_of_some(capture: Path) -> bool:
 
 def require_all(files: Sequence[Path], cure: str) -> None:
     """Raise one SceneError for all missing mask files: their number, the first three, and the cure."""
-    missing = [file for file in files if not file.is_file()]
+    missing = [file for file in files if not os.path.isfile(file)]  # Path.is_file fails for names that are too long
     if missing:  # one error for all: a capture may lack hundreds
         folder = missing[0].parents[0]
-        names = ", ".join(file.name for file in missing[:3]) + (", ..." if len(missing) > 3 else "")
+        names = ", ".join(printable(file.name, 80) for file in missing[:3]) + (", ..." if len(missing) > 3 else "")
         raise SceneError(
             f"{len(missing)} of {len(files)} posed images have no mask: {folder} lacks {names}; expected one per "
             f"image: {cure}, or remove the image from the pose file"

@@ -218,11 +218,11 @@ def _made_before(target: Path, tasks: Sequence[ImageTask], key: str) -> dict[str
     """The record of a run that made the same masks of the same images, if all its files are still there."""
     folder = target / MASKS_FOLDER
     try:
-        made = json.loads((folder / MADE_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        made = read_json_object(folder / MADE_NAME)  # of a capture that may come from a stranger
+    except SceneError:
         return None
     files = [target / FEATURES_NAME, *(folder / f"{task.photograph.name}.png" for task in tasks)]
-    same = isinstance(made, dict) and made.get("key") == key and isinstance(made.get("masks"), int)
+    same = made.get("key") == key and isinstance(made.get("masks"), int)
     return made if same and all(file.is_file() for file in files) else None
 
 
