@@ -12,18 +12,10 @@ pytest.importorskip("rosbags")
 
 from commands import run
 from frame_messages import (
-    COMPRESSED,
-    compressed,
-    image_message,
-    messages_of,
-    place_of,
-    png,
-    stamp_of,
-    transform,
-    without_losses,
+    COMPRESSED, compressed, image_message, messages_of, place_of, png, stamp_of, transform, without_losses,
 )  # fmt: skip
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
-from og_pointcloud_ros.frames import FrameAssembler, compressed_image_array
+from og_pointcloud_ros.frames import ENCODINGS, FrameAssembler, compressed_image_array
 from og_pointcloud_ros.map_bags import BagFrames
 from og_pointcloud_ros.messages import plain_messages
 from rosbags.rosbag2 import Writer
@@ -339,6 +331,18 @@ def test_masks_that_were_changed_by_jpeg_are_left_out(tmp_path):
     read = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:2], (), as_jpeg, OF_TRANSPORTS))
     assert [frame.masks for frame in read] == [None, None]
     assert any("masks are JPEG images, which change numbers" in reason for reason in read.dropped)
+
+
+@pytest.mark.parametrize(("role", "encoding", "says"), [
+    ("depth", "mono8", "depth is uint8; expected 16UC1, millimeters, or 32FC1, meters"),
+    ("masks", "32FC1", "masks are float32; expected 8UC1, 16UC1 or 32SC1"),
+])  # fmt: skip
+def test_pixels_of_the_wrong_kind_are_refused(role, encoding, says):
+    """Depth drawn as a gray image has lost the lengths; a mask's number has no fractions."""
+    code = ENCODINGS[encoding][0]
+    message = image_message(plain_messages, np.ones((4, 5), code), encoding, 0)
+    with pytest.raises(SceneError, match=says):
+        FrameAssembler().add(role, message)
 
 
 def test_a_damaged_compressed_image_is_named():

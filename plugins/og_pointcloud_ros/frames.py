@@ -32,6 +32,13 @@ ENCODINGS = {
     "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "rgba8": ("u1", 4), "bgra8": ("u1", 4),
 }  # fmt: skip
 """Encoding of an image -> type and number of its channels."""
+KINDS = {"depth": ("u2", "i4", "f4"), "masks": ("u1", "u2", "i4")}
+"""Types of pixels, by role."""
+WRONG_KINDS = {
+    "depth": "is {}; expected 16UC1, millimeters, or 32FC1, meters: 8 bits have lost the lengths",
+    "masks": "are {}; expected 8UC1, 16UC1 or 32SC1: numbers of masks",
+}
+"""What an error says of other types."""
 JPEG = b"\xff\xd8"
 """First bytes of a JPEG file."""
 MAX_METERS = 250.0
@@ -124,6 +131,8 @@ class FrameAssembler:
                     f"{role} are JPEG images, which change numbers; expected PNG, compressedDepth or raw ones"
                 )
             pixels = compressed_image_array(message) if compressed else image_array(message)
+            if role in KINDS and pixels.dtype.str[1:] not in KINDS[role]:
+                raise SceneError(f"{role} {WRONG_KINDS[role].format(pixels.dtype)}")
             if role == "color" and pixels.ndim == 2:  # of a gray camera
                 pixels = np.repeat(pixels[..., None], 3, axis=2)
             setattr(parts, role, pixels)
