@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -336,6 +337,20 @@ def test_numbers_beyond_floats(tmp_path):
     (tmp_path / "b.json").write_text(json.dumps([{"segmentation": [[huge, *square[1:]]], "size": [9, 9]}]))
     with pytest.raises(SceneError, match="annotation 0: a polygon is "):
         ExistingMasks(tmp_path).of("b", (9, 9))
+
+
+def test_masks_of_a_larger_image_are_not_held_at_its_size(tmp_path):
+    """A line of a COCO file may state any size: 30 lines took 2 GB."""
+    height, width = 600, 500
+    rle = {"size": [height, width], "counts": [0, height * 250, height * 250]}
+    (tmp_path / "a.json").write_text(json.dumps([{"segmentation": rle}] * 200))
+    ExistingMasks(tmp_path).of("a", (6, 5))  # loads what it needs
+    tracemalloc.start()
+    masks = ExistingMasks(tmp_path).of("a", (6, 5)).masks
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * height * width
+    np.testing.assert_array_equal(masks, np.tile([True, True, False, False, False], (200, 6, 1)))
 
 
 def test_a_color_png_is_refused(tmp_path):

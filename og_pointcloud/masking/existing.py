@@ -148,9 +148,9 @@ class ExistingMasks:
         # The image's own files come before files for all images.
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
-            return _resized(from_ids(read_ids(png), none=-1, tracks=self.tracks), shape)
+            return from_ids(_resized(read_ids(png), shape), none=-1, tracks=self.tracks)
         if single.is_file():
-            return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
+            return _from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single), shape)
         # Views are named by stem, or by a path below a folder that may be part of COCO's paths.
         with _READING_COCO:
             coco = self._coco
@@ -161,7 +161,7 @@ class ExistingMasks:
             if f"/{path}".endswith(f"/{image_name}") or ("/" in path and f"/{image_name}".endswith(f"/{path}"))
         ]  # fmt: skip
         if len(named) == 1:
-            return _resized(_from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'"), shape)
+            return _from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'", shape)
         if named:
             raise SceneError(
                 f"{self.folder} lists {len(named)} images that '{image_name}' could be ({', '.join(named):.120}); "
@@ -259,24 +259,27 @@ def _annotations(found: Any) -> list[dict[str, Any]]:
     return found
 
 
-def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Proposals | None:
-    """The masks of one image's annotations; None where there are none, as their size is then unknown."""
-    masks, scores = [], []
+def _from_annotations(annotations: Sequence[dict[str, Any]], source: str, shape: tuple[int, int]) -> Proposals:
+    """The masks of one image's annotations, each resized to ``shape`` at once: of a larger image, all would not fit
+    into memory."""
+    _check_room(len(annotations), shape, source)
+    masks, scores, stored = np.zeros((len(annotations), *shape), np.bool_), [], None
     for index, annotation in enumerate(annotations):
         where = f"{source}, annotation {index}"
         segmentation = annotation.get("segmentation")
         if isinstance(segmentation, list):
-            masks.append(_polygons(segmentation, annotation.get("size"), where))
+            mask = _polygons(segmentation, annotation.get("size"), where)
         else:
-            masks.append(decode_rle(segmentation, where))
-        if masks[-1].shape != masks[0].shape:
-            raise SceneError(f"{where} is {masks[-1].shape}, the first {masks[0].shape}; expected masks of one image")
-        _check_room(len(masks), masks[0].shape, source)
+            mask = decode_rle(segmentation, where)
+        stored = stored or mask.shape
+        if mask.shape != stored:
+            raise SceneError(f"{where} is {mask.shape}, the first {stored}; expected masks of one image")
+        masks[index] = _resized(mask, shape)
         score = annotation.get("score", annotation.get("predicted_iou", 1.0))
         # Not numpy's functions, which refuse whole numbers beyond 64 bits.
         finite = isinstance(score, (int, float)) and abs(score) < math.inf
         scores.append(float(min(max(score, 0), 1)) if finite else 1.0)
-    return Proposals(np.array(masks), np.array(scores, np.float32)) if masks else None
+    return Proposals(masks, np.array(scores, np.float32))
 
 
 def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
@@ -307,16 +310,13 @@ def _inside(corners: DoubleArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.logical_xor.accumulate(flips[:, :width], axis=1)
 
 
-def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
-    """Masks at the size of their image, by nearest pixel."""
-    if proposals is None or not len(proposals):
-        return Proposals(np.zeros((0, *shape), np.bool_), np.zeros(0, np.float32))
-    height, width = proposals.masks.shape[1:]
+def _resized(image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+    """A mask or id map (H, W) at another size, by nearest pixel."""
+    height, width = image.shape
     # The old pixel that contains the center of each new pixel.
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
-    masks = proposals.masks[:, rows.astype(np.int64)[:, None], columns.astype(np.int64)]
-    return Proposals(masks, proposals.scores, proposals.tracks)
+    return image[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
 
 
 def _check_room(masks: int, shape: tuple[int, ...], source: str) -> None:
