@@ -353,6 +353,18 @@ def test_masks_of_a_larger_image_are_not_held_at_its_size(tmp_path):
     np.testing.assert_array_equal(masks, np.tile([True, True, False, False, False], (200, 6, 1)))
 
 
+@pytest.mark.parametrize("kind", ["png", "json"])
+def test_masks_of_images_turned_upright_are_refused(tmp_path, kind):
+    """They were stretched: masks are for images as stored, whatever their EXIF orientation says."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.ones((160, 120), np.uint8))
+    if kind == "json":
+        (tmp_path / "a.png").unlink()
+        (tmp_path / "a.json").write_text(json.dumps([{"segmentation": {"size": [160, 120], "counts": [0, 19200]}}]))
+    assert len(ExistingMasks(tmp_path).of("a", (40, 30))) == 1
+    with pytest.raises(SceneError, match=r"masks are 120x160 pixels, the image 40x30.* EXIF orientation"):
+        ExistingMasks(tmp_path).of("a", (30, 40))
+
+
 def test_a_color_png_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
     with pytest.raises(SceneError, match=r"8-bit RGB .*expected an 8-bit or 16-bit gray PNG"):

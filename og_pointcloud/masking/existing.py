@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, first_line
-from og_pointcloud.formats.images import MAX_PIXELS, without_suffix
+from og_pointcloud.formats.images import MAX_PIXELS, same_shape, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
@@ -148,7 +148,7 @@ class ExistingMasks:
         # The image's own files come before files for all images.
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
-            return from_ids(_resized(read_ids(png), shape), none=-1, tracks=self.tracks)
+            return from_ids(_resized(read_ids(png), shape, str(png)), none=-1, tracks=self.tracks)
         if single.is_file():
             return _from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single), shape)
         # Views are named by stem, or by a path below a folder that may be part of COCO's paths.
@@ -274,7 +274,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str, shape:
         stored = stored or mask.shape
         if mask.shape != stored:
             raise SceneError(f"{where} is {mask.shape}, the first {stored}; expected masks of one image")
-        masks[index] = _resized(mask, shape)
+        masks[index] = _resized(mask, shape, where)
         score = annotation.get("score", annotation.get("predicted_iou", 1.0))
         # Not numpy's functions, which refuse whole numbers beyond 64 bits.
         finite = isinstance(score, (int, float)) and abs(score) < math.inf
@@ -310,9 +310,15 @@ def _inside(corners: DoubleArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.logical_xor.accumulate(flips[:, :width], axis=1)
 
 
-def _resized(image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    """A mask or id map (H, W) at another size, by nearest pixel."""
+def _resized(image: NDArray[Any], shape: tuple[int, int], source: str) -> NDArray[Any]:
+    """A mask or id map (H, W) at another size, by nearest pixel. SceneError where its sides are those of the image
+    turned by a quarter."""
     height, width = image.shape
+    if same_shape((width, height), shape) and not same_shape((height, width), shape):
+        raise SceneError(
+            f"{source}: the masks are {width}x{height} pixels, the image {shape[1]}x{shape[0]}; expected masks of the "
+            "image as stored: make them without turning it by its EXIF orientation"
+        )
     # The old pixel that contains the center of each new pixel.
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
