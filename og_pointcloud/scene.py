@@ -411,7 +411,7 @@ def pose_matrix(pose: ArrayLike, what: str = "pose", cure: str = ", cloud to wor
 
 def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
     """Largest entry of R R' - 1 for a matrix (3, 3), 0 for orthonormal rows, NaN where it overflows; and det R."""
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return float(np.abs(matrix @ matrix.T - np.eye(3)).max()), float(np.linalg.det(matrix))
 
 

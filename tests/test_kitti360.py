@@ -94,6 +94,17 @@ def test_damaged_files_name_the_cure(tmp_path, file, content, said):
         read_poses(tmp_path)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning", "ignore:.*no finite pose")
+@pytest.mark.parametrize(("number", "says"), [("inf", "none of its"), ("1e-320", "differs from a rotation")])
+def test_absurd_poses_make_no_warnings_of_numpy(tmp_path, number, says):
+    write_kitti360(tmp_path, right=False)
+    file = tmp_path / f"data_poses/{DRIVE}/cam0_to_world.txt"
+    pose = f"0 0 1 100 {number} 0 0 200 0 -1 0 1.5 0 0 0 1"
+    file.write_text("\n".join(f"{line.split()[0]} {pose}" for line in file.read_text().splitlines()))
+    with pytest.raises(SceneError, match=says):
+        read_poses(tmp_path)
+
+
 @pytest.mark.filterwarnings("ignore:.*no finite pose")
 def test_several_drives_and_several_clouds_are_refused(tmp_path):
     write_kitti360(tmp_path)

@@ -50,7 +50,9 @@ def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
         for file in images:
             path = file.relative_to(folder).as_posix()
             pose = pose_of_frame.get(float(file.stem)) if file.stem.isdecimal() else None
-            yield RecordedFrame(path, poses_file, None if pose is None else pose @ beside, sensor)
+            with np.errstate(over="ignore", invalid="ignore"):  # poses that are not finite are left out
+                pose = None if pose is None else pose @ beside
+            yield RecordedFrame(path, poses_file, pose, sensor)
 
 
 def find_static_cloud(folder: Path) -> Path | None:
