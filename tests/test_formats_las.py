@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -155,3 +156,27 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
         write_las(path, points.xyz_world[1:], gray[1:], fewer, ("bush",), tmp_path / "survey.laz")
     with pytest.raises(SceneError, match=r"none\.laz: No such file"):  # not only the file to write
         write_las(path, points.xyz_world, gray, attributes, ("tree",), path.with_name("none.laz"))
+
+
+def test_points_that_a_laz_only_claims_take_no_memory(tmp_path):
+    """A million at once, of 1,460 bytes each, took 1.5 GB of a file of 19 kB."""
+    laspy = pytest.importorskip("laspy")
+    path, header = tmp_path / "wide.laz", laspy.LasHeader(point_format=0, version="1.2")
+    header.add_extra_dims([laspy.ExtraBytesParams(f"wide{index}", "3f8") for index in range(60)])
+    wide = laspy.LasData(header)
+    wide.xyz = np.zeros((5, 3))
+    wide.write(path, do_compress=True)
+    data = bytearray(path.read_bytes())
+    data[107:111] = struct.pack("<I", 50_000_000)  # LAS 1.2: the number of points
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SceneError, match=r"wide.laz: cannot be read as LAS"):
+            read_points(path)
+        with pytest.raises(SceneError, match="50000000 points, 5 were labelled"):
+            write_las(
+                tmp_path / "out.laz", np.zeros((5, 3)), np.zeros((5, 3), np.uint8), attributes_of([0] * 5), (), path
+            )
+        assert tracemalloc.get_traced_memory()[1] < 1 << 28
+    finally:
+        tracemalloc.stop()

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from laspy import LasData
 
 SIGNATURE = b"LASF"
-POINTS_PER_CHUNK = 1_000_000
-"""Read at once, so that memory use depends on the points in the file, not on the count in its header."""
+POINTS_PER_CHUNK, CHUNK_BYTES = 1_000_000, 1 << 26
+"""Read at once, at most, so that memory use depends on the points in the file, not on the count in its header."""
 UNLABELLED = 1
 """Class "processed, but unclassified"; also used for labels beyond the last free class."""
 FIRST_FREE_CLASS, LAST_CLASS = 64, 255
@@ -69,7 +69,8 @@ def read_las(path: StrPath) -> Points:
         if not (scales > 0).all():  # 0 puts all points in one place; a negative scale mirrors them
             raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 numbers above 0: export it again")
         has_colors = "red" in reader.header.point_format.dimension_names
-        for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
+        at_once = max(1, min(POINTS_PER_CHUNK, CHUNK_BYTES // reader.header.point_format.size))
+        for chunk in reader.chunk_iterator(at_once):
             xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
             if has_colors:
                 rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
@@ -136,9 +137,10 @@ def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArra
 def _points_of(source: Path, count: int) -> LasData:
     """A file's points in a point format with 8-bit classes, without the labels of an earlier run."""
     with _opened(source) as reader:
-        las = reader.read()
-        if len(las.points) != count:
-            raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the labelled file")
+        stated = reader.header.point_count
+        las = reader.read() if stated == count else None  # it allocates memory for as many as are stated
+        if las is None or len(las.points) != count:
+            raise SceneError(f"it has {stated} points, {count} were labelled; expected the labelled file")
     degrees = getattr(las, "scan_angle_rank", None)
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
     if degrees is not None:  # laspy drops it: its name and unit differ in the new format
