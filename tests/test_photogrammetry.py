@@ -187,6 +187,8 @@ def test_repeated_labels_are_told_apart_by_their_groups(tmp_path):
         (('type="frame"', 'type="cylindrical"'), r"of type 'cylindrical'; expected frame, fisheye or spherical"),
         (("<document", "<!DOCTYPE a><document"), r"defines entities"),
         (("<resolution", "<size"), r"its sensor has no resolution"),
+        (("</chunk>", "<transform><scale>0</scale></transform></chunk>"), r"its scale is 0; expected a number above 0"),
+        (("</chunk>", "<transform><scale>-2</scale></transform></chunk>"), r"its scale is -2; expected"),
         (("<camera ", '<camera enabled="0" '), r"none of its 0 cameras has a pose"),
     ],
 )

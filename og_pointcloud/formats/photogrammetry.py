@@ -154,8 +154,11 @@ def _world_of(element: ElementTree.Element) -> World | None:
     if transform is None:
         return None
     rotation, translation, scale = (transform.find(name) for name in ("rotation", "translation", "scale"))
+    factor = 1.0 if scale is None else float(_floats(scale, 1)[0])
+    if factor <= 0:  # all cameras in one place, or mirrored places
+        raise SceneError(f"its scale is {factor:g}; expected a number above 0: export the cameras again")
     return (
-        1.0 if scale is None else float(_floats(scale, 1)[0]),
+        factor,
         np.eye(3) if rotation is None else _floats(rotation, 9).reshape(3, 3),
         np.zeros(3) if translation is None else _floats(translation, 3),
     )
