@@ -212,7 +212,7 @@ def test_truncated_empty_and_foreign_files_are_one_error_and_stay(tmp_path):
         assert (tmp_path / "a.e57").read_bytes() == data
     for data in (b"", b"PK\x03\x04 not this"):
         (tmp_path / "a.e57").write_bytes(data)
-        with pytest.raises(SceneError, match=r"not a geometry file that can be read"):
+        with pytest.raises(SceneError, match=r"not a geometry file that can be read|not a whole zip, as a SOG"):
             read_points(tmp_path / "a.e57")
         with pytest.raises(OgPointcloudError, match=r"not a whole E57 file"):
             unpack_e57(tmp_path / "a.e57", tmp_path / "capture")

@@ -138,7 +138,7 @@ def test_what_is_no_sog_is_told(tmp_path):
             read_points(written(path, meta, {**members, name: data}))
     whole = written(path, meta, members).read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SceneError, match="not a whole zip"):
+    with pytest.raises(SceneError, match="not a whole zip, as a SOG file is"):
         read_points(path)
 
 

@@ -12,7 +12,15 @@ pytest.importorskip("rosbags")
 
 from commands import run
 from frame_messages import (
-    COMPRESSED, compressed, image_message, messages_of, place_of, png, stamp_of, transform, without_losses,
+    COMPRESSED,
+    compressed,
+    image_message,
+    messages_of,
+    place_of,
+    png,
+    stamp_of,
+    transform,
+    without_losses,
 )  # fmt: skip
 from og_pointcloud_ros.bags import ros2_types, rosbags_messages
 from og_pointcloud_ros.frames import ENCODINGS, FrameAssembler, compressed_image_array

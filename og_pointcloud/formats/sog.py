@@ -65,7 +65,7 @@ def read_sog(path: StrPath) -> Points:
             RuntimeError,
             UnicodeDecodeError,
         ) as error:
-            raise SceneError(f"not a whole zip ({error!s:.80}): copy or export it again") from None
+            raise SceneError(f"not a whole zip, as a SOG file is ({error!s:.80}): copy or export it again") from None
         least, most = sog.numbers("means", "mins", 3), sog.numbers("means", "maxs", 3)
         share = (low + high.astype(np.float64) * 256) / 65535
         logarithm = least + (most - least) * share
