@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import shutil
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -221,6 +222,13 @@ def test_nothing_is_left_behind_when_writing_fails(tmp_path):
         write_bundle(cloud, tmp_path / "s.ogpc")
     assert (tmp_path / "s.ogpc").read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["s.ogpc"]
+
+
+def test_a_capture_in_place_of_its_file_is_told(tmp_path, bundle_file):
+    (tmp_path / "kitchen").mkdir()
+    refuse(tmp_path / "kitchen", r"is not a file; expected a \.ogpc file: check the name")
+    shutil.copy(bundle_file, tmp_path / "kitchen.ogpc")
+    refuse(tmp_path / "kitchen", r"did you mean .*kitchen\.ogpc\?")
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"PK\x03\x04" + bytes(100), bytes(70_000)])

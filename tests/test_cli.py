@@ -219,6 +219,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("fit",), "CAPTURE"),
         (("fit", "capture", "-o", "s.ogpc", "--mask-levle", "large"), "did you mean '--mask-level'"),
         (("fit", "capture", "-o", "s.ogpc", "--mask", "large"), "'og-pointcloud fit' does not accept '--mask'"),
+        (("segment", "s.ogpc", "--labels", "chair", "table"), "accept 'table'; several words take commas: --labels ch"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "quick"), "quick"),
         (("fit", "capture", "-o", "s.zip"), "expected a name that ends in .ogpc"),
         (("fit", "capture", "-o", "s.ogpc", "--json", "s.ogpc"), "expected a name that ends in .json"),

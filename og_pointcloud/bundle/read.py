@@ -51,9 +51,10 @@ def read_bundle(path: StrPath) -> Bundle:
     ('two-words', 3)
     """
     if not isinstance(path, (str, os.PathLike)) or not os.path.isfile(path):
-        raise BundleError(
-            f"{path} is not a file; expected a .ogpc file: check the name, or make it (og-pointcloud fit)"
-        )
+        cure = "check the name, or make it (og-pointcloud fit)"
+        if isinstance(path, (str, os.PathLike)) and (beside := Path(path).with_suffix(".ogpc")).is_file():
+            cure = f"did you mean {beside}?"  # a capture's folder has the same name
+        raise BundleError(f"{path} is not a file; expected a .ogpc file: {cure}")
     path = Path(path)
     try:
         with path.open("rb") as file:

@@ -118,4 +118,7 @@ def build_parser() -> Parser:
 def describe_unknown_option(option: str, arguments: argparse.Namespace) -> str:
     known = arguments.parser._option_string_actions
     command = arguments.parser.prog
-    return f"'{command}' does not accept '{option}'{did_you_mean(option.split('=')[0], known)} (see '{command} --help')"
+    hint = did_you_mean(option.split("=")[0], known)
+    if not option.startswith("-") and "--labels" in known:
+        hint = "; several words take commas: --labels chair,table"
+    return f"'{command}' does not accept '{option}'{hint} (see '{command} --help')"
