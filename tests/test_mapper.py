@@ -56,6 +56,33 @@ def test_a_known_cloud_ends_as_a_fit_does():
     assert np.mean(same) > 0.99
 
 
+def test_what_left_a_known_cloud_and_returns_is_there_again():
+    mapper, _ = mapped(frames(THINGS), cloud=scene(THINGS).points)
+    known = {entry.id: entry.points for entry in mapper.objects()}
+    (crate,) = (entry.id for entry in mapper.objects() if np.abs(entry.place[:2] - [0.65, 0.7]).max() < 0.2)
+    gone = [change.gone for change in map(mapper.integrate, frames([CHEST, BIN], seed=1, first=100.0))]
+    assert sum(gone, ()) == (crate,)
+    left = mapper.snapshot().cloud
+    back = [change.moved for change in map(mapper.integrate, frames(THINGS, seed=2, first=200.0))]
+    assert [move.id for move in sum(back, ())] == [crate]
+    objects = {entry.id: entry for entry in mapper.objects()}
+    assert {entry.state for entry in objects.values()} == {"present"}, "it stands where it stood"
+    assert objects.keys() == known.keys()
+    assert abs(objects[crate].points - known[crate]) < 0.1 * known[crate]
+    cloud = mapper.snapshot().cloud
+    assert len(left) < len(cloud) <= len(scene(THINGS).points)
+    assert instance_of(cloud, CRATE) == crate
+
+
+def test_a_late_frame_brings_nothing_back_to_a_known_cloud():
+    mapper, _ = mapped([*frames(THINGS), *frames([CHEST, BIN], seed=1, first=100.0)], cloud=scene(THINGS).points)
+    before = mapper.points
+    for frame in frames(THINGS, seed=2, first=50.0):
+        mapper.integrate(frame)
+    assert mapper.points <= before
+    assert [entry.state for entry in mapper.objects()].count("gone") == 1
+
+
 def test_depth_alone_makes_the_points(grown):
     mapper, _ = grown
     cloud = mapper.snapshot().cloud

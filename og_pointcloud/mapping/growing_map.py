@@ -24,7 +24,7 @@ from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
-from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.mapping.voxels import MAX_READINGS, VoxelPoints
 from og_pointcloud.rendering.geometry import depths, isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
@@ -105,10 +105,13 @@ class GrowingMap:
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
         """Add the readings of a frame, thinned to the map's density and without flying pixels, which lie between two
-        surfaces. Returns the rows of the new points."""
+        surfaces. Returns the rows of the new points; of known geometry, those of points that had left and are measured
+        again."""
         points, view, before = self.points, frame.view, self.points.n
-        if view is None or not points.grows:
+        if view is None:
             return np.zeros(0, np.int32)
+        if not points.grows:
+            return self._returned(view, frame.stamp)
         left = np.flatnonzero(~points.alive)
         image, camera = DepthImage(view.depth, view.camera), view.camera
         step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
@@ -130,6 +133,16 @@ class GrowingMap:
         # What comes where others had left takes their rows.
         self.kept.born[added] = self.kept.born[left[points.weight[left] > 0]] = self.sequence
         return added
+
+    def _returned(self, view: MeasuredView, stamp: float) -> NDArray[np.int32]:
+        """Rows of the points that had left and that a view measures where they were; they are there again."""
+        points, presence = self.points, self.presence
+        rows = points.packets.in_view(view.camera, points.edge)
+        left = rows[(points.weight[rows] == 0) & (presence.seen_at[rows] <= stamp)]  # not by a late frame
+        back = left[states_of_points(points.xyz[left], presence.tolerance, view) == AGREES]
+        points.weight[back], presence.balance[back], presence.seen_at[back] = MAX_READINGS, 1, stamp
+        self.kept.born[back] = self.sequence
+        return back
 
     def owners(self) -> NDArray[np.int32]:
         """(n,) the track of each point, NO_TRACK for those that left."""
