@@ -42,7 +42,7 @@ TWO_CAMERAS = {"back info": "/back/camera_info", "back color": "/back/image_rect
                "color": "/front/image_rect"}  # fmt: skip
 
 
-def write_bag(folder, given, without=(), messages=messages_of, topics=TOPICS):
+def write_bag(folder, given, without=(), messages=messages_of, topics=TOPICS, unplaced=()):
     store = ros2_types()
     make = rosbags_messages(store)
     with Writer(folder, version=8) as bag:
@@ -52,6 +52,8 @@ def write_bag(folder, given, without=(), messages=messages_of, topics=TOPICS):
         out = {t: bag.add_connection(t, kind, typestore=store) for t, kind in kinds.items() if t not in without}
         for recorded, frame in enumerate(given):
             sent = {"/tf": transform(make, "map", "camera", *place_of(frame), stamp_of(frame))}
+            if recorded in unplaced:
+                sent = {}
             sent |= {topics[role]: message for role, message in messages(make, frame).items()}
             for topic in sent.keys() & out:
                 bag.write(out[topic], recorded, store.serialize_cdr(sent[topic], kinds[topic]))
@@ -213,6 +215,12 @@ def test_masks_and_features_of_different_stamps_are_counted(tmp_path):
         f"{one} came without {other} of the same stamp: give both the stamp of their image": 3
         for one, other in (("masks", "features"), ("features", "masks"))
     }
+
+
+def test_frames_outside_the_time_of_tf_are_counted_together(tmp_path):
+    read = BagFrames(write_bag(tmp_path / "drive", frames(THINGS)[:5], unplaced=(0, 3, 4)))
+    assert len(list(read)) == 2
+    assert read.dropped == {"'camera' in 'map' is known from 2.000 to 3.000 s, not at the time of some frames": 3}
 
 
 def beside_a_raw_image(make, frame):

@@ -12,6 +12,7 @@ one stamp are one frame.
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -28,6 +29,8 @@ IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 TRANSPORTS = ("/compressed", "/compresseddepth")
 """What image_transport appends to the topic of an image for that of the compressed one, in lower case."""
+OUTSIDE_TF = re.compile(r"not at \S+ s$")
+"""How `TransformTree.lookup` ends for a stamp outside the known interval."""
 MAX_PENDING_STAMPS = 100
 """Number of stamps that wait for their other messages; masks come seconds after their image."""
 
@@ -75,7 +78,8 @@ class BagFrames:
             if (frame := assembler.frame(stamp, partial(tree.lookup, self.frame))) is not None:
                 yield frame
         except OgPointcloudError as error:
-            self.dropped[str(error)] += 1
+            # Frames outside the time of tf are counted together, whatever the time of each.
+            self.dropped[OUTSIDE_TF.sub("not at the time of some frames", str(error))] += 1
         assembler.forget(stamp)
 
 
