@@ -199,7 +199,7 @@ def test_info_tells_what_is_inside(fitted, capsys):
 def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
     import og_pointcloud_export
 
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(og_pointcloud_export, "write_bundle", interrupt)
