@@ -16,9 +16,12 @@ from scenes import COLORS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.bundle.vocabulary import scene_words
+from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate import sweep as sweeping
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
+from og_pointcloud.evaluate.captures import ask
 from og_pointcloud.evaluate.knobs import DEFAULT, KNOBS, Setting, settings_of
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, read_subject, sweep
 from og_pointcloud.evaluate.sweep_report import write_chart, write_report
@@ -145,6 +148,24 @@ def test_points_at_one_place_are_fitted_as_a_fit_does(folder, subject, tmp_path)
     cloud = fit(again.scene, progress=False)
     assert list(default.left_out) == cloud.provenance["left_out"]
     assert default.instances == len(cloud.instances)
+
+
+def test_labels_are_judged_by_the_word_bank_that_a_fit_has(folder, tmp_path):
+    for file in folder.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    with np.load(folder / "mask_features.npz") as masks:  # words that fit what masks show better than its name does
+        rows = np.concatenate([rows for name, rows in masks.items() if name != "feature_space"])
+        everyday = rows[np.arange(60) % len(rows)] + np.random.default_rng(0).normal(0, 0.01, (60, rows.shape[1]))
+        bank = {"names": np.array([f"word {k}" for k in range(len(everyday))]), "vectors": everyday}
+        np.savez(tmp_path / "word_bank.npz", feature_space=masks["feature_space"], **bank)
+    subject = read_subject(tmp_path)
+    (found,) = sweep([subject], [DEFAULT], progress=False).rows[:1]
+    space = FeatureSpace(subject.scene.feature_space, subject.scene.feature_width)
+    cloud = scene_words(space, capture=tmp_path).added_to(fit(subject.scene, progress=False))
+    as_eval = subject.truth.score(ask(cloud, subject.truth, tmp_path / "text_features.npz").called)
+    assert found.miou == as_eval.miou
+    plain = read_subject(folder)
+    assert found.unknown > sweep([plain], [DEFAULT], progress=False).rows[0].unknown
 
 
 def test_a_capture_that_cannot_be_fitted_is_named_and_costs_no_other(subject, monkeypatch):

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.cloud import FeatureSpace, Vocabulary
+from og_pointcloud.bundle.vocabulary import scene_words
+from og_pointcloud.cloud import FeatureSpace, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.captures import Answer, difference
@@ -50,12 +51,14 @@ Labels = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Subject:
-    """A capture, the words to query, and the truth of its points. Both are None where the folder lacks either."""
+    """A capture, the words to query, and the truth of its points. Both are None where the folder lacks either.
+    word_bank: by which a fit of it judges labels, as `bundle.vocabulary.scene_words` finds it; None without one."""
 
     name: str
     scene: Scene
     vocabulary: Vocabulary | None
     truth: Truth | None
+    word_bank: WordBank | None = None
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ def read_subject(folder: Path) -> Subject:
         )
     masks, names = (scene.feature_space, scene.feature_width), (space, vocabulary.vectors.shape[1])
     FeatureSpace(*masks).require(FeatureSpace(*names), f"names of {words}")
-    return Subject(folder.name, scene, vocabulary, truth)
+    return Subject(folder.name, scene, vocabulary, truth, scene_words(FeatureSpace(*masks), capture=folder).word_bank)
 
 
 def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, progress: bool = True) -> Sweep:
@@ -187,7 +190,8 @@ class _Trial:
         seconds = time.perf_counter() - start
         scores: dict[str, Any] = {}
         if (words := self.subject.vocabulary) is not None:
-            labels = LabelledScene.from_cloud(cloud).chooser.choose(words.vectors).at(cloud.instance_ids)[0]
+            judged = LabelledScene.from_cloud(replace(cloud, word_bank=self.subject.word_bank))
+            labels = judged.chooser.choose(words.vectors).at(cloud.instance_ids)[0]
             scores = self._scores(labels, cloud.spacing)
         error = 1 - scores.get("miou", cloud.reliability or 0.0)
         return Row(
