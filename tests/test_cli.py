@@ -292,9 +292,12 @@ def test_a_demo_below_a_file_is_refused_before_its_room_is_made(tmp_path, monkey
 def test_a_demo_leaves_the_captures_of_others(tmp_path, monkeypatch, capsys):
     demo, made = pytest.importorskip("og_pointcloud_room.demo"), []
     monkeypatch.setattr(demo, "run_demo", lambda *given, **options: made.append(given))
-    (tmp_path / "capture").mkdir()
-    assert "/capture is not a demo's; expected a new folder" in error_of(capsys, "demo", "-o", tmp_path)
+    (tmp_path / "transforms.json").touch()  # a capture itself, or one below
+    assert "holds other files; expected an empty folder" in error_of(capsys, "demo", "-o", tmp_path)
     assert not made
+    (tmp_path / "transforms.json").unlink()
+    output_of(capsys, "demo", "-o", tmp_path)
+    made.clear()
     (tmp_path / "room.ogpc").touch()
     output_of(capsys, "demo", "-o", tmp_path)
     assert made == [(tmp_path,)], "an earlier demo is made again"

@@ -30,9 +30,8 @@ def run(arguments: argparse.Namespace) -> None:
     room = arguments.output / "room.ogpc"
     check_output("-o", room, [])
     begun = arguments.output / ".demo"
-    for folder in (arguments.output / "capture", arguments.output / "photographs"):
-        if folder.exists() and not (room.exists() or begun.exists()):
-            raise OgPointcloudError(f"{folder} is not a demo's; expected a new folder: name another (-o)")
+    if not (room.exists() or begun.exists()) and arguments.output.is_dir() and any(arguments.output.iterdir()):
+        raise OgPointcloudError(f"{arguments.output} holds other files; expected an empty folder: name another (-o)")
     arguments.output.mkdir(parents=True, exist_ok=True)
     begun.touch()  # what an interrupted demo leaves is the next one's to replace
     from og_pointcloud_room.demo import run_demo
