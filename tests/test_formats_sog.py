@@ -155,3 +155,20 @@ def test_a_file_made_to_fill_memory_is_refused_unread(tmp_path):
         archive.writestr("meta.json", b" " * (1 << 22))
     with pytest.raises(SceneError, match=r"meta\.json claims 4194304 bytes"):
         read_points(path)
+
+
+def test_a_directory_that_points_anywhere_is_no_bare_error(tmp_path):
+    meta, members = packed(splats(60))
+    path = written(tmp_path / "a.sog", meta, members)
+    whole = bytearray(path.read_bytes())
+    start = whole.index(b"PK\x01\x02")
+    said = set()
+    for at in range(start, len(whole)):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            read_points(path)
+        except SceneError as error:
+            said.add(str(error).partition(": ")[2][:15])
+    assert any(text.startswith("not a whole zip") for text in said)

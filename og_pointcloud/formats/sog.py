@@ -16,13 +16,15 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError, printable
+from og_pointcloud.errors import OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import StrPath
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
 from og_pointcloud.formats.images import decoded_bytes, require_cv2, stated_size
@@ -52,20 +54,10 @@ def read_sog(path: StrPath) -> Points:
     """
     path = Path(path)
     with naming(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                sog = _Sog(archive, path.stat().st_size)
-                low, high = sog.pixels("means", 0)[:, :3], sog.pixels("means", 1)[:, :3]
-                scales, rotation, color = sog.pixels("scales")[:, :3], sog.pixels("quats"), sog.pixels("sh0")
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            UnicodeDecodeError,
-        ) as error:
-            raise SceneError(f"not a whole zip, as a SOG file is ({error!s:.80}): copy or export it again") from None
+        with _whole_zip(), zipfile.ZipFile(path) as archive:
+            sog = _Sog(archive, path.stat().st_size)
+            low, high = sog.pixels("means", 0)[:, :3], sog.pixels("means", 1)[:, :3]
+            scales, rotation, color = sog.pixels("scales")[:, :3], sog.pixels("quats"), sog.pixels("sh0")
         least, most = sog.numbers("means", "mins", 3), sog.numbers("means", "maxs", 3)
         share = (low + high.astype(np.float64) * 256) / 65535
         logarithm = least + (most - least) * share
@@ -81,6 +73,17 @@ def read_sog(path: StrPath) -> Points:
         return activated(
             xyz, scale, from_smallest_three(rotation[:, 3] - LARGEST_CODES, others), color[:, 3] / 255, base
         )
+
+
+@contextmanager
+def _whole_zip() -> Iterator[None]:
+    """SceneError for all that zipfile raises of damaged files; our own errors pass."""
+    try:
+        yield
+    except OgPointcloudError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError, OSError) as error:
+        raise SceneError(f"not a whole zip, as a SOG file is ({error!s:.80}): copy or export it again") from None
 
 
 class _Sog:
