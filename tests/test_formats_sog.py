@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import tracemalloc
 import zipfile
 
@@ -172,3 +173,19 @@ def test_a_directory_that_points_anywhere_is_no_bare_error(tmp_path):
         except SceneError as error:
             said.add(str(error).partition(": ")[2][:15])
     assert any(text.startswith("not a whole zip") for text in said)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_compressions_are_refused_unread(tmp_path, method):
+    """Python unpacks them whole, whatever size the zip states: a gigabyte of 900 bytes of bz2."""
+    path = written(tmp_path / "a.sog", b" " * (1 << 25), {}, method)
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + 24, 1000)  # the size that it states
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SceneError, match=rf"meta.json is compressed by method {method}; expected 0 .* or 8 "):
+            read_points(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()

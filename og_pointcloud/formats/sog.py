@@ -141,4 +141,10 @@ class _Sog:
     def _bytes(self, name: str, most: int) -> bytes:
         if (size := self._members[name].file_size) > most:
             raise SceneError(f"{printable(name, 40)} claims {size} bytes; expected at most {most}")
+        # zipfile unpacks bz2 and lzma whole, whatever size is claimed.
+        if (method := self._members[name].compress_type) not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise SceneError(
+                f"{printable(name, 40)} is compressed by method {method}; expected {zipfile.ZIP_STORED} (stored) or "
+                f"{zipfile.ZIP_DEFLATED} (deflated): export it again"
+            )
         return self._archive.read(name)
