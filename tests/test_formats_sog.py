@@ -154,7 +154,7 @@ def test_a_file_made_to_fill_memory_is_refused_unread(tmp_path):
     tracemalloc.stop()
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", b" " * (1 << 22))
-    with pytest.raises(SceneError, match=r"meta\.json claims 4194304 bytes"):
+    with pytest.raises(SceneError, match=r"a\.sog: meta\.json claims 4194304 bytes; expected at most 1048576$"):
         read_points(path)
 
 
@@ -184,7 +184,9 @@ def test_other_compressions_are_refused_unread(tmp_path, method):
     path.write_bytes(data)
     tracemalloc.start()
     try:
-        with pytest.raises(SceneError, match=rf"meta.json is compressed by method {method}; expected 0 .* or 8 "):
+        with pytest.raises(
+            SceneError, match=rf"sog: meta.json is compressed by method {method}; expected 0 .* or 8 .*: export"
+        ):
             read_points(path)
         assert tracemalloc.get_traced_memory()[1] < 1 << 23
     finally:

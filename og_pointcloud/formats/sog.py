@@ -94,8 +94,9 @@ class _Sog:
         self._members = {info.filename: info for info in archive.infolist()}
         if META not in self._members:
             raise SceneError("a zip without meta.json; expected a SOG file of splats, as SuperSplat exports it")
+        content = self._bytes(META, MAX_META_BYTES)
         try:
-            self._meta = json.loads(self._bytes(META, MAX_META_BYTES))
+            self._meta = json.loads(content)
         except (ValueError, RecursionError) as error:
             raise SceneError(f"its meta.json is no JSON ({error!s:.80}): copy or export it again") from None
         version = self._meta.get("version") if isinstance(self._meta, dict) else None
