@@ -231,6 +231,12 @@ def test_a_capture_in_place_of_its_file_is_told(tmp_path, bundle_file):
     refuse(tmp_path / "kitchen", r"did you mean .*kitchen\.ogpc\?")
 
 
+@pytest.mark.parametrize("path", ["", ".", "/", "long" * 1000, None])
+def test_what_has_no_name_or_too_long_a_one_is_no_file(path):
+    with pytest.raises(BundleError, match=r"is not a file; expected a \.ogpc file: check the name"):
+        read_bundle(path)
+
+
 @pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"PK\x03\x04" + bytes(100), bytes(70_000)])
 def test_no_zip(tmp_path, content):
     (tmp_path / "s.ogpc").write_bytes(content)

@@ -52,7 +52,9 @@ def read_bundle(path: StrPath) -> Bundle:
     """
     if not isinstance(path, (str, os.PathLike)) or not os.path.isfile(path):
         cure = "check the name, or make it (og-pointcloud fit)"
-        if isinstance(path, (str, os.PathLike)) and (beside := Path(path).with_suffix(".ogpc")).is_file():
+        # Not Path.with_suffix and is_file, which fail for "." and for names that are too long.
+        beside = f"{os.path.splitext(Path(path))[0]}.ogpc" if isinstance(path, (str, os.PathLike)) else ""
+        if os.path.isfile(beside):
             cure = f"did you mean {beside}?"  # a capture's folder has the same name
         raise BundleError(f"{path} is not a file; expected a .ogpc file: {cure}")
     path = Path(path)
