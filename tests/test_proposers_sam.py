@@ -17,7 +17,7 @@ transformers = pytest.importorskip("transformers")
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from og_pointcloud.masking.automatic import AutomaticMasks  # noqa: E402
-from og_pointcloud.masking.sam import SamPredictor, prepared, scaled_size  # noqa: E402
+from og_pointcloud.masking.sam import IMAGENET_MEAN_STD, Preparation, SamPredictor, prepared, scaled_size  # noqa: E402
 
 KINDS = ("sam", "sam_hq", "sam2", "sam3")
 PROMPT = {"hidden_size": 32, "mask_input_channels": 4}
@@ -130,6 +130,13 @@ def test_squares_are_resized_as_pillow_does_and_colors_come_from_the_models_file
     expected = ((resized - [0.1, 0.2, 0.3]) / [0.5, 0.6, 0.7]).transpose(2, 0, 1)
     assert side == {"sam2": 64, "sam3": 56}[kind]
     assert np.abs(prepared(image, preparation)[0].numpy() - expected).max() < 1.01 / 255 / 0.5
+
+
+def test_a_strip_of_an_image_keeps_a_pixel_of_its_shorter_side():
+    wide = Preparation(1024, True, *IMAGENET_MEAN_STD)
+    assert scaled_size((1, 2400), wide) == (1, 1024)
+    assert scaled_size((2400, 1), wide) == (1024, 1)
+    assert prepared(np.zeros((1, 2400, 3), np.uint8), wide).shape == (1, 3, 1024, 1024)
 
 
 def test_colors_without_a_file_are_the_familys(folders):

@@ -121,7 +121,8 @@ def scaled_size(size: tuple[int, int], preparation: Preparation) -> tuple[int, i
     if not preparation.padded:
         return preparation.side, preparation.side
     scale = preparation.side / max(size)
-    return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
+    # At least one: the shorter side of a strip rounds to 0, and torch resizes nothing to that.
+    return max(1, int(size[0] * scale + 0.5)), max(1, int(size[1] * scale + 0.5))
 
 
 def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor:
