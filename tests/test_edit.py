@@ -16,6 +16,7 @@ import og_pointcloud as og
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
+from og_pointcloud.formats.points import read_points
 from og_pointcloud.show.splat_columns import rotated_harmonics
 
 SH_CONSTANT = 0.28209479177387814
@@ -360,6 +361,25 @@ def test_inserted_splats_of_another_degree_keep_their_colors(tmp_path, base_degr
     expected = colors_seen(vertices(files[1]), directions, room_for)
     np.testing.assert_allclose(colors_seen(vertices(done.path)[3:], directions), expected, atol=1e-6)
     assert len(done.notes) == (other_degree > base_degree)
+
+
+@pytest.mark.parametrize("of_base", ["harmonics", "bytes"])
+def test_inserted_splats_keep_their_colors_as_the_base_has_its_own(tmp_path, of_base):
+    """nerfstudio's exporter writes harmonics, or red green blue in their place."""
+    rgb = np.array([[255, 40, 0], [0, 0, 0], [12, 200, 255]], np.uint8)
+    harmonics = gaussian_columns(np.eye(3), 0)
+    as_bytes = {name: column for name, column in harmonics.items() if not name.startswith("f_dc_")}
+    as_bytes |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
+    for channel in range(3):
+        harmonics[f"f_dc_{channel}"] = ((rgb[:, channel] / 255 - 0.5) * math.sqrt(4 * math.pi)).astype(np.float32)
+    kinds = [harmonics, as_bytes] if of_base == "harmonics" else [as_bytes, harmonics]
+    files = tmp_path / "base.ply", tmp_path / "other.ply"
+    for path, columns in zip(files, kinds, strict=True):
+        write_ply(path, {"vertex": join_columns(columns)})
+    done = og.edit.insert(*files, tmp_path / "out.ply")
+    np.testing.assert_array_equal(read_points(done.path).rgb, np.tile(rgb, (2, 1)))
+    assert vertices(done.path).dtype == vertices(files[0]).dtype
+    assert done.notes == ()
 
 
 def covariances(rows):

@@ -80,6 +80,7 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The rows of both, with the columns of the first; and notes of what was lost. If the two have colors in different
     columns or types, both become bytes. Positions become float64 if the first's type would move points
     (`storable_positions`)."""
+    added = _colored_like(base, added)
     first, second = _columns(base), _with_harmonics(added, _rest_names(base))
     places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
     first |= {axis: first[axis].astype(np.promote_types(first[axis].dtype, places)) for axis in "xyz"}
@@ -95,6 +96,21 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     if dropped := [name for name in _columns(added) if name not in first]:
         notes.append(f"{_listed(dropped)} of the inserted points are left out: the cloud does not have them")
     return join_columns(merged), tuple(notes)
+
+
+def _colored_like(base: Rows, added: Rows) -> Rows:
+    """The added rows with their color as the base has it, as harmonics or as red green blue: nerfstudio's exporter
+    writes either."""
+    columns, rgb, kept = _columns(added), colors(added), set(base.dtype.names or ())
+    is_harmonic = set(BASE_COLOR) <= set(columns)
+    if not is_harmonic and rgb is not None and set(BASE_COLOR) <= kept:
+        columns = {name: column for name, column in columns.items() if name in kept or name not in COLORS}
+        columns |= dict(zip(BASE_COLOR, ((rgb / 255 - 0.5) / SH_CONSTANT).T, strict=True))
+    elif is_harmonic and rgb is None and colors(base) is not None:
+        color = np.clip(0.5 + SH_CONSTANT * stack_columns(added, BASE_COLOR), 0, 1)
+        columns = {name: column for name, column in columns.items() if name in kept or name not in BASE_COLOR}
+        columns |= dict(zip(RGB, np.rint(255 * color).astype(np.uint8).T, strict=True))
+    return join_columns(columns)
 
 
 def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
