@@ -99,7 +99,7 @@ def _rows(
         folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
         if not rows:
             warm_up(read_capture(folder))
-        rows.append(measure(folder, settings, not options.quick, changes, options.largest_pieces))
+        rows.append(measure(folder, settings, not options.quick, changes, largest_pieces=options.largest_pieces))
         print(line(rows[-1]), flush=True)
         write_csv(rows, file)
     return rows

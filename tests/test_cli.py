@@ -220,6 +220,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("fit", "capture", "-o", "s.ogpc", "--mask-levle", "large"), "did you mean '--mask-level'"),
         (("fit", "capture", "-o", "s.ogpc", "--mask", "large"), "'og-pointcloud fit' does not accept '--mask'"),
         (("segment", "s.ogpc", "--labels", "chair", "table"), "accept 'table'; several words take commas: --labels ch"),
+        (("segment", "s.ogpc", "labels"), "accept 'labels'; did you mean '--labels'?"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "quick"), "quick"),
         (("fit", "capture", "-o", "s.zip"), "expected a name that ends in .ogpc"),
         (("fit", "capture", "-o", "s.ogpc", "--json", "s.ogpc"), "expected a name that ends in .json"),

@@ -119,6 +119,6 @@ def describe_unknown_option(option: str, arguments: argparse.Namespace) -> str:
     known = arguments.parser._option_string_actions
     command = arguments.parser.prog
     hint = did_you_mean(option.split("=")[0], known)
-    if not option.startswith("-") and "--labels" in known:
+    if not option.startswith("-") and getattr(arguments, "labels", None):
         hint = "; several words take commas: --labels chair,table"
     return f"'{command}' does not accept '{option}'{hint} (see '{command} --help')"
