@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.bundle.vocabulary import scene_words
+from og_pointcloud.checking.check import CaptureWarning
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate import sweep as sweeping
@@ -49,6 +51,16 @@ def subject(folder):
 @pytest.fixture(scope="module")
 def prepared(folder):
     return prepare(read_capture(folder))
+
+
+def test_warming_up_warns_of_nothing(subject, monkeypatch):
+    """Two views of a few points may well look wrong: only the fit itself warns."""
+    monkeypatch.setattr(sweeping, "fit", lambda *_, **__: warnings.warn("poses", CaptureWarning, stacklevel=2))
+    with warnings.catch_warnings(record=True) as heard:
+        sweeping.warm_up(subject.scene)
+        assert not heard
+        warnings.warn("kept", CaptureWarning, stacklevel=1)
+    assert [str(one.message) for one in heard] == ["kept"]
 
 
 def row(seconds: float, error: float, knob: str = "k", value: str = "v", capture: str = "c") -> Row:

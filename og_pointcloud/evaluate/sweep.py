@@ -14,6 +14,7 @@ import os
 import platform
 import re
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.bundle.vocabulary import scene_words
+from og_pointcloud.checking.check import CaptureWarning
 from og_pointcloud.cloud import FeatureSpace, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.evaluate.baselines import baseline_labels
@@ -231,7 +233,9 @@ def warm_up(scene: Scene, settings: FitSettings | None = None) -> None:
     """Fit two views of a few points, so that no measured seconds include loading compiled code."""
     points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
     views = tuple(view for view in scene.views if view.mask_count)[:2]
-    with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will report
+    # Two views of a few points may show nothing, or look wrong: only the whole scene's fit is to say so.
+    with suppress(OgPointcloudError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", CaptureWarning)
         fit(replace(scene, points=points, views=views), settings, progress=False)
 
 
