@@ -88,7 +88,11 @@ for name in ("rendering", "fitting"):  # the one piece without a public name; it
         gaussians = splatting.Gaussians(*(data[f"{which}_{part}"] for part in ("xyz", "scale", "rotation", "opacity")))
         width, height, fx, fy, cx, cy = data[f"{which}_camera"].tolist()
         camera = og.Camera(int(width), int(height), fx, fy, cx, cy, np.eye(4))
-        return splatting.view_weights(gaussians, camera, data[f"{which}_ids"], 30, float(data["near"])).rows
+        near, pixels = float(data["near"]), camera.width * camera.height
+        if not hasattr(splatting, "ViewWeights"):
+            return splatting.view_weights(gaussians, camera, near)
+        ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)  # as it was called before
+        return splatting.view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
     draw("view")
     timed("kernel", lambda: draw("view"), runs=5, clock=time.process_time)
     error["kernel"] = float(np.abs(draw("window").toarray() - data["exact"]).max() / data["exact"].max())
@@ -144,7 +148,7 @@ def write_files(folder: Path) -> np.ndarray:
         at = case.camera
         numbers = np.array([at.width, at.height, at.fx, at.fy, at.cx, at.cy])
         parts = {f"{name}_{part}": getattr(case.gaussians, part) for part in ("xyz", "scale", "rotation", "opacity")}
-        return {**parts, f"{name}_camera": numbers, f"{name}_ids": case.ids}
+        return {**parts, f"{name}_camera": numbers}
 
     exact = {"exact": reference_of(window), "near": np.array(view.near)}
     np.savez(folder / "kernel.npz", **arrays("view", view), **arrays("window", window), **exact)

@@ -197,7 +197,7 @@ class Trial:
         key = changed(settings, "paper.matching", MatchingSettings()), shapes
         surface, table = prepared.surface, prepared.table
         if self.source is None:
-            drawn = surface.gaussians, surface.thinned_views(), surface.near, settings.paper
+            drawn = surface.gaussians, surface.scene.views, surface.near, settings.paper
             self.source = RenderedViews(*drawn, whole=False)
         if key not in self.trained:
             start = time.process_time()

@@ -35,6 +35,7 @@ from og_pointcloud.evaluate.metrics import Score
 from og_pointcloud.evaluate.sweep import warm_up
 from og_pointcloud.evaluate.truth import GT_NAME, Truth
 from og_pointcloud.fitting.fit import fit_prepared, prepare
+from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.colors import label_colors
@@ -174,8 +175,9 @@ def _possible(capture: RoomCapture, points: Points) -> NDArray[np.int64]:
     gaussians, class_of, held_out = _in_world(points), _class_of(capture), _held_out(len(capture.frames))
     light = np.zeros((len(capture.names) + 1, len(points)))
     for view, camera in zip(held_out, _cameras(capture, held_out), strict=True):
-        ids = class_of[capture.frames[view].owner]
-        light += view_weights(gaussians, camera, ids, len(capture.names), NEAREST).rows.toarray()
+        cls = class_of[capture.frames[view].owner].ravel()
+        row = np.where(cls < 0, len(capture.names), cls).astype(np.int32)
+        light += (indicator(row, len(light)) @ view_weights(gaussians, camera, NEAREST)).toarray()
     best = light.argmax(axis=0)
     return np.where((best < len(capture.names)) & light.any(axis=0), best, -1)
 

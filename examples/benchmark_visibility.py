@@ -1,4 +1,4 @@
-"""The visibility kernel: seconds per view on one core, and error against float64, in the same row.
+"""The blending kernel: seconds per view on one core, and error against float64, in the same row.
 
     python examples/benchmark_visibility.py              # made rooms of 10,000 to a million Gaussians
     python examples/benchmark_visibility.py CAPTURE      # also the middle view of a capture, as `fit` draws it
@@ -22,8 +22,9 @@ if __name__ == "__main__":  # otherwise tests that import it would run on one co
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from og_pointcloud.rendering.splatting import Gaussians, ViewWeights, view_weights
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -38,23 +39,20 @@ RUNS = 5
 
 @dataclass(frozen=True)
 class Case:
-    """A view to draw: ids (H, W) int32 with mask_count masks, thickness (n,) or None as for `view_weights`."""
+    """A view to draw."""
 
     name: str
     gaussians: Gaussians
     camera: Camera
-    ids: NDArray[np.int32]
-    mask_count: int
     near: float
-    thickness: NDArray[np.float32] | None = None
 
-    def draw(self) -> ViewWeights:
+    def draw(self) -> csr_array:
         """The kernel's result."""
-        return view_weights(self.gaussians, self.camera, self.ids, self.mask_count, self.near, self.thickness)
+        return view_weights(self.gaussians, self.camera, self.near)
 
 
 def room_case(count: int, width: int = IMAGE[0], height: int = IMAGE[1]) -> Case:
-    """Points on the walls of a room that fill the view, half a spacing large and 0.7 opaque; 30 masks with gaps."""
+    """Points on the walls of a room that fill the view, half a spacing large and 0.7 opaque."""
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-1, 1, (count, 3)) * [1.33, 1.0, 1.0]
     wall = rng.integers(0, 5, count)
@@ -63,33 +61,26 @@ def room_case(count: int, width: int = IMAGE[0], height: int = IMAGE[1]) -> Case
     scale = np.full((count, 3), 0.5 * np.sqrt(14.0 / count), np.float32)
     rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
     gaussians = Gaussians(xyz.astype(np.float32), scale, rotation, np.full(count, 0.7, np.float32))
-    column, row = np.meshgrid(np.arange(width) * 6 // width, np.arange(height) * 5 // height)
-    ids = (row * 6 + column).astype(np.int32)
-    ids[:: height // 5] = -1
     camera = Camera(width, height, 0.55 * width, 0.55 * width, width / 2, height / 2, np.eye(4))
-    return Case(f"room, {count:,}", gaussians, camera, ids, 30, NEAR)
+    return Case(f"room, {count:,}", gaussians, camera, NEAR)
 
 
 def capture_case(folder: Path) -> Case:
     """The middle view of a capture, as `fit` draws it."""
     from og_pointcloud.fitting.fit import prepare
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.rendering.geometry import thinned
 
     scene = read_capture(folder)
     middle = scene.views[len(scene.views) // 2]
     surface = prepare(replace(scene, views=scene.views[:: max(1, len(scene.views) // 10)])).surface
-    view = thinned(middle, surface.stride)
-    thickness = (6 * surface.neighborhood.spacing).astype(np.float32)
-    name = f"{folder.name}, {len(scene.points):,}"
-    return Case(name, surface.gaussians, view.camera, view.mask_map(), view.mask_count, surface.near, thickness)
+    return Case(f"{folder.name}, {len(scene.points):,}", surface.gaussians, middle.camera, surface.near)
 
 
 def window_of(case: Case) -> Case:
     """The middle of a view, without Gaussians far from it in the image."""
-    width, height = (min(size, whole) for size, whole in zip(WINDOW, case.ids.shape[::-1], strict=True))
-    left, top = (case.camera.width - width) // 2, (case.camera.height - height) // 2
     camera = case.camera
+    width, height = min(WINDOW[0], camera.width), min(WINDOW[1], camera.height)
+    left, top = (camera.width - width) // 2, (camera.height - height) // 2
     view = replace(camera, width=width, height=height, cx=camera.cx - left, cy=camera.cy - top)
     x, y, z = (case.gaussians.xyz @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -97,25 +88,25 @@ def window_of(case: Case) -> Case:
         room = 4 * view.fx * case.gaussians.scale.max(axis=1) / z + 4
     close = (z > case.near) & (u > -room) & (u < width + room) & (v > -room) & (v < height + room)
     few = Gaussians(*(getattr(case.gaussians, name)[close] for name in ("xyz", "scale", "rotation", "opacity")))
-    ids = np.ascontiguousarray(case.ids[top : top + height, left : left + width])
-    return replace(case, gaussians=few, camera=view, ids=ids, thickness=None)
+    return replace(case, gaussians=few, camera=view)
 
 
 def reference_of(window: Case) -> NDArray[np.float64]:
-    """(mask_count + 1, n) float64, by the literal reference."""
-    from reference_splatting import reference_view_weights  # pyright: ignore[reportMissingImports]  (in tests/)
+    """(pixels, n) float64, by the literal reference."""
+    from reference_splatting import reference_pixel_weights  # pyright: ignore[reportMissingImports]  (in tests/)
 
-    return reference_view_weights(window.gaussians, window.camera, window.ids, window.mask_count, window.near)
+    weights = reference_pixel_weights(window.gaussians, window.camera, window.near)
+    return weights.reshape(-1, len(window.gaussians))
 
 
 def errors(window: Case) -> tuple[float, float]:
     """Largest and mean error of a window's weights, relative to the largest and the mean weight."""
     reference = reference_of(window)
-    error = np.abs(window.draw().rows.toarray() - reference)
+    error = np.abs(window.draw().toarray() - reference)
     return float(error.max() / reference.max()), float(error.sum() / reference.sum())
 
 
-def fastest(work: Callable[[], ViewWeights]) -> float:
+def fastest(work: Callable[[], csr_array]) -> float:
     """Processor seconds, the least of several runs after a discarded one."""
     taken = []
     for _ in range(RUNS + 1):

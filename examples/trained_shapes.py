@@ -60,7 +60,7 @@ def train_with_shapes(
         adam.step()
     trained = RenderedViews(reshaped(base, logit, log_size), source.views, near, settings, whole=False)
     features = np.zeros((len(base), settings.width), np.float32)
-    features[trained.known] = read_features(raw.detach().numpy()[trained.known], normalize=True)
+    features[trained.known] = read_features(raw.detach().numpy()[trained.known])
     return raw.detach().numpy(), features, trained
 
 

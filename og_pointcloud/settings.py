@@ -145,8 +145,6 @@ class _LossSettings(_Checked):
 
     width: int = 6
     """Columns of a feature (paper, Sec. 3.1)."""
-    normalize: bool = True
-    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
     intra: bool = True
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
@@ -163,8 +161,7 @@ class _LossSettings(_Checked):
 
 @dataclass(frozen=True)
 class FeatureSettings(_LossSettings):
-    """Instance features from the mask table (learned/instance_features.py). Without ``normalize`` they are kept within
-    the unit ball."""
+    """Instance features from the mask table (learned/instance_features.py)."""
 
     closest: float = 0.035
     """Eq. 2 stops growing where two mask means are nearer than this; directions at right angles read 0.71 apart."""
@@ -178,12 +175,10 @@ class FeatureSettings(_LossSettings):
 class CodebookSettings(_Checked):
     """Two-level codebook without rendering (learned/codebook.py; paper, Sec. 3.2, Eq. 3)."""
 
-    levels: Literal[1, 2] = 2
-    """1: coarse clusters alone. 2: fine ones within those whose masks show several things."""
     k1: int | None = None
     """Coarse clusters; None: as many as there are things. The paper's 64 or 32 are its limitation 2."""
     k2: int | None = None
-    """Fine clusters in each coarse one; None: as many as masks of one view fall into it."""
+    """Fine clusters in each coarse one, 1 for coarse ones alone; None: as many as masks of one view fall into it."""
     position_weight: float = 2.0
     """In coarse clusters the scene's extent counts as much as this feature distance (Eq. 3; published: per scene unit).
     0: features alone."""
@@ -224,6 +219,8 @@ LITERAL_MATCHING = MatchingSettings(threshold=0.2, min_views=2, visible=False, s
 class PaperSettings(_LossSettings):
     """The method as published, by rendering (learned/paper.py). At schedule_share 1 its steps are the authors'."""
 
+    normalize: bool = True
+    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
     schedule: Literal["scannet", "lerf"] = "scannet"
     """Steps of the three stages: 20k, 20k, 20k (ScanNet) or 10k, 10k, 20k (LeRF)."""
     schedule_share: float = 1.0
@@ -288,18 +285,6 @@ class PaperSettings(_LossSettings):
 
 
 @dataclass(frozen=True)
-class VisibilitySettings(_Checked):
-    """Where the mask table is kept while it grows (mask_table.py, work_folder.py)."""
-
-    table_share: float = 0.4
-    """Share of the memory left that the table may fill; the rest is on disk. What is derived from it takes as much."""
-    views_share: float = 0.3
-    """Share of the memory left that views processed in parallel may fill; one is always processed."""
-    keep_after_s: float = 20.0
-    """Finished views are kept for a restart only where all views together take longer than this, in seconds."""
-
-
-@dataclass(frozen=True)
 class FitSettings(_Checked):
     """Settings of `fit`. The defaults are meant for every scene; none needs tuning.
 
@@ -321,7 +306,6 @@ class FitSettings(_Checked):
     tile_points: int | None = None
     """Fit in tiles of at most this many points; None: only where the whole cloud would not fit into memory."""
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
-    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     grouping: GroupingSettings = field(default_factory=GroupingSettings)
     membership: MembershipSettings = field(default_factory=MembershipSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
 
-from og_pointcloud.rendering.splatting import Gaussians, view_weights
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Camera
 
 Wide = np.longdouble
@@ -22,13 +21,6 @@ def round_splats(xyz: ArrayLike, scale: ArrayLike, opacity: ArrayLike = 0.9) -> 
     size, rotation = np.broadcast_to(np.reshape(scale, (-1, 1)), (n, 3)), np.tile(np.float32([1, 0, 0, 0]), (n, 1))
     opacities = np.broadcast_to(np.asarray(opacity, np.float32), n).copy()
     return Gaussians(np.asarray(xyz, np.float32), size.astype(np.float32), rotation, opacities)
-
-
-def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
-    """The library's own weights W of one view, by a map that gives every pixel its own id: (H W, n) sparse float32."""
-    pixels = camera.width * camera.height
-    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    return view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
 
 
 def reference_pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:
@@ -46,15 +38,6 @@ def reference_pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -
         weights[drawn, g] = (transmittance * alpha)[drawn]
         transmittance[drawn] = rest[drawn]
     return weights
-
-
-def reference_view_weights(
-    gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32], id_count: int, near: float
-) -> NDArray[np.float64]:
-    """(id_count + 1, n) float64: the weights above, added up over the pixels of every id; last row: id -1."""
-    weights = reference_pixel_weights(gaussians, camera, near)
-    rows = [weights[ids == i].sum(axis=0) for i in (*range(id_count), -1)]
-    return np.array(rows)
 
 
 def front_to_back(gaussians: Gaussians, camera: Camera, near: float) -> list[int]:

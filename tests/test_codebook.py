@@ -184,7 +184,7 @@ def test_fine_clusters_part_what_coarse_ones_hold_together() -> None:
     assert same_partition(codebook.leaf, thing)
     assert codebook.coarse_count == 2
     assert (np.diff(codebook.leaf_coarse) >= 0).all()
-    alone = build(CodebookSettings(k1=2, position_weight=5.0, levels=1))
+    alone = build(CodebookSettings(k1=2, position_weight=5.0, k2=1))
     assert len(alone.leaf_centers) == 2
     at_most_three = build(CodebookSettings(k1=2, position_weight=5.0, k2=3))
     np.testing.assert_array_equal(at_most_three.leaf_coarse, [0, 0, 0, 1, 1, 1])
@@ -224,7 +224,7 @@ def test_unit_and_place_of_the_scene_do_not_matter() -> None:
 def test_outliers_do_not_set_the_extent() -> None:
     _, xyz, thing, _ = room()
     xyz[[5, 700]] = [[1e5, 0, 0], [0, -1e5, 0]]
-    codebook = build(CodebookSettings(levels=1), xyz=xyz)
+    codebook = build(CodebookSettings(k2=1), xyz=xyz)
     plain = np.ones(len(thing), bool)
     plain[[5, 700]] = False
     assert same_partition(codebook.leaf[plain], thing[plain])
@@ -234,7 +234,7 @@ def test_outliers_do_not_set_the_extent() -> None:
 def test_positions_may_outweigh_features_by_any_factor() -> None:
     """Squares of 1e30 are infinite in float32: no start is then better than another, and one must be taken."""
     _, _, thing, _ = room()
-    codebook = build(CodebookSettings(k1=2, levels=1, position_weight=1e30))
+    codebook = build(CodebookSettings(k1=2, k2=1, position_weight=1e30))
     assert same_partition(codebook.leaf, thing // 4)
 
 

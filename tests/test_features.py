@@ -9,7 +9,6 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import pixel_weights
 from scenes import TinyCapture
 from scipy.sparse import csr_array, random_array, vstack
 
@@ -20,8 +19,9 @@ from og_pointcloud.fitting.learned.instance_features import (
     raw_gradient,
     read_features,
 )
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.rendering.splatting import view_weights
 from og_pointcloud.settings import FeatureSettings
 
 torch = pytest.importorskip("torch")
@@ -60,10 +60,10 @@ def random_views(seed: int = 0, n: int = 40, pixels: int = 90, mask_counts: tupl
 
 def rendered(weights: list[csr_array], ids: list[NDArray[np.int32]], mask_counts: list[int]) -> Rendered:
     rows, pixels = [], []
-    for view_weights, view_ids, count in zip(weights, ids, mask_counts, strict=True):
+    for weights_of, view_ids, count in zip(weights, ids, mask_counts, strict=True):
         inside = np.flatnonzero(view_ids >= 0)
         member = csr_array((np.ones(len(inside), np.float32), (view_ids[inside], inside)), (count, len(view_ids)))
-        rows.append(member @ view_weights)
+        rows.append(member @ weights_of)
         pixels.append(np.bincount(view_ids[inside], minlength=count))
     nothing = csr_array((len(weights), weights[0].shape[1]), dtype=np.float32)
     view = np.repeat(np.arange(len(weights), dtype=np.int32), mask_counts)
@@ -79,10 +79,9 @@ def tiny(tiny_capture: TinyCapture) -> Rendered:
     scene = read_capture(tiny_capture.folder)
     surface = prepare(scene).surface
     gaussians = surface.gaussians.take(surface.row_of_point)  # in the order of the capture's truth
-    table = mask_table(gaussians, scene.views, 0.05)
-    weights = [pixel_weights(gaussians, view.camera, 0.05) for view in scene.views]
+    weights = [view_weights(gaussians, view.camera, 0.05) for view in scene.views]
     ids = [view.mask_map().ravel() for view in scene.views]
-    return Rendered(weights, ids, [view.mask_count for view in scene.views], table)
+    return rendered(weights, ids, [view.mask_count for view in scene.views])
 
 
 def literal(scene: Rendered, settings: FeatureSettings, values: NDArray[np.floating]) -> tuple[float, NDArray]:
@@ -153,22 +152,21 @@ def test_points_bound_what_covered_pixels_show() -> None:
     assert 0.1 * bound < shown < bound
 
 
-@pytest.mark.parametrize("normalize", [True, False])
-def test_gradient_by_raw_features_equals_the_automatic_one(normalize: bool) -> None:
+def test_gradient_by_raw_features_equals_the_automatic_one() -> None:
     rng = np.random.default_rng(0)
     raw = rng.normal(size=(30, WIDTH)) * rng.uniform(0.1, 1.5, (30, 1))
     by_read = rng.normal(size=raw.shape)
     f = torch.tensor(raw, requires_grad=True)
     length = f.norm(dim=1, keepdim=True)
-    read = 0.5 + 0.5 * f / length if normalize else f / length.clamp(min=1)
+    read = 0.5 + 0.5 * f / length
     (read * torch.tensor(by_read)).sum().backward()
-    np.testing.assert_allclose(read_features(raw, normalize), read.detach().numpy(), rtol=1e-14)
-    pulled = raw_gradient(raw, by_read, normalize)
+    np.testing.assert_allclose(read_features(raw), read.detach().numpy(), rtol=1e-14)
+    pulled = raw_gradient(raw, by_read)
     np.testing.assert_allclose(pulled, f.grad.numpy(), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [FeatureSettings(), FeatureSettings(normalize=False), FeatureSettings(width=2)])
+@pytest.mark.parametrize("settings", [FeatureSettings(), FeatureSettings(width=2)])
 def test_objects_come_apart_and_keep_together(
     tiny: Rendered, tiny_capture: TinyCapture, settings: FeatureSettings
 ) -> None:

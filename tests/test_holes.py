@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 
 from og_pointcloud.fitting.holes import HALF_PLANE_MEAN_DIRECTION, WINDOW_POINTS, seen_through_holes
-from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE
-from og_pointcloud.fitting.see_through import without_see_through
+from og_pointcloud.fitting.see_through import SEEN_THROUGH_SHARE, without_see_through
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
 

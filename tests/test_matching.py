@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import pixel_weights, round_splats
+from reference_splatting import round_splats
 from test_grouping import ONE, OTHER, HandView, hand_table
-from test_visibility import NEAR, camera, cloud, patches
+from test_visibility import NEAR, camera, cloud, patches, table_of
 
 from og_pointcloud.fitting.learned.matching import (
     Evidence,
@@ -21,8 +21,7 @@ from og_pointcloud.fitting.learned.matching import (
     rendered_masks,
     visible_evidence,
 )
-from og_pointcloud.fitting.mask_table import mask_table
-from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
@@ -55,29 +54,24 @@ def turned(angle: float) -> Camera:
     return camera(world_to_camera=pose)
 
 
-def test_visible_evidence_is_the_sum_over_pixels() -> None:
-    """Areas and features of two views, from the weights of every pixel, in float64."""
+def test_visible_evidence_is_the_sum_over_points() -> None:
+    """Areas and features of two views, from all that they show, in float64."""
     random = np.random.default_rng(0)
     gaussians = cloud(random)
     views = [View(f"v{k}", turned(0.2 * k), patches(turned(0.2 * k)), np.ones((12, 3), np.float32)) for k in range(2)]
-    table = mask_table(gaussians, views, NEAR)
+    table = table_of(gaussians, views)
     ids = random.integers(-1, 5, len(gaussians)).astype(np.int32)
     features, mask_features = random.random((5, 6)), random.random((24, 6))
     evidence = visible_evidence(table, ids, features, mask_features)
 
     onehot = (ids[:, None] == np.arange(5)).astype(np.float64)
-    for index, view in enumerate(views):
-        weights = pixel_weights(gaussians, view.camera, NEAR).toarray().astype(np.float64)
-        pixels = view.mask_map().ravel()
-        np.testing.assert_allclose(evidence.instance_area[index], (weights @ onehot).sum(axis=0), rtol=1e-5)
-        for mask in range(12):
-            row, inside = 12 * index + mask, weights[pixels == mask]
-            np.testing.assert_allclose(evidence.shared[row], (inside @ onehot).sum(axis=0), rtol=1e-5, atol=1e-9)
-            np.testing.assert_allclose(evidence.mask_area[row], inside.sum(), rtol=1e-5)
-            apart = np.abs(mask_features[row] - features).sum(axis=1)
-            known = evidence.shared[row] > 0
-            np.testing.assert_allclose(evidence.distance[row, known], apart[known])
-            assert np.isinf(evidence.distance[row, ~known]).all()
+    shown, outside = table.weights.toarray().astype(np.float64), table.outside.toarray().astype(np.float64)
+    np.testing.assert_allclose(evidence.shared, shown @ onehot, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(evidence.mask_area, shown.sum(axis=1), rtol=1e-5)
+    in_views = [(shown[12 * k : 12 * k + 12].sum(axis=0) + outside[k]) @ onehot for k in range(2)]
+    np.testing.assert_allclose(evidence.instance_area, in_views, rtol=1e-5)
+    apart = np.abs(mask_features[:, None] - features).sum(axis=2)
+    np.testing.assert_allclose(evidence.distance, np.where(evidence.shared > 0, apart, np.inf))
     assert (evidence.shared > 0).any()
 
 
@@ -105,20 +99,21 @@ def both(a: Gaussians, b: Gaussians) -> Gaussians:
 
 
 def test_alone_is_visible_where_nothing_is_in_front() -> None:
-    """Two opaque walls side by side: both ways see the same pixels, to within their soft edges."""
+    """Two opaque walls side by side: both ways see the same, to within their soft edges; their rows of points
+    are a tenth farther apart than those of pixels."""
     left, right = wall((-0.5, -0.1), 1.0), wall((0.15, 0.5), 1.0)
     gaussians, ids = both(left, right), np.repeat([0, 1], [len(left), len(right)]).astype(np.int32)
     masks = np.full((37, 50), -1, np.int32)
     masks[8:28, 3:22], masks[8:28, 28:46] = 0, 1
     view = View("v", camera(), masks, np.ones((2, 3), np.float32))
-    table = mask_table(gaussians, [view], NEAR)
+    table = table_of(gaussians, [view])
     colors = np.stack([RED, GREEN])
     visible = visible_evidence(table, ids, colors, colors)
     alone = alone_evidence(gaussians, [view], NEAR, ids, colors, colors, 0.7)
     scores = eq5_scores(visible, table.mask_view, SETTINGS), eq5_scores(alone, table.mask_view, SETTINGS)
     assert scores[0].diagonal().min() > 0.7
-    np.testing.assert_allclose(*scores, atol=0.1)
-    np.testing.assert_allclose(alone.instance_area, visible.instance_area, rtol=0.1)
+    np.testing.assert_allclose(*scores, atol=0.15)
+    np.testing.assert_allclose(alone.instance_area, visible.instance_area, rtol=0.25)
 
 
 def test_alone_compares_the_map_with_the_filled_mask_pixel_by_pixel() -> None:
@@ -130,7 +125,7 @@ def test_alone_compares_the_map_with_the_filled_mask_pixel_by_pixel() -> None:
     ids = np.zeros(len(gaussians), np.int32)
     feature, of_mask = np.array([0.9, 0.3]), np.array([0.8, 0.4])
     evidence = alone_evidence(gaussians, [view], NEAR, ids, feature[None], of_mask[None], 0.7)
-    alpha = pixel_weights(gaussians, camera(), NEAR).toarray().astype(np.float64).sum(axis=1)
+    alpha = view_weights(gaussians, camera(), NEAR).toarray().astype(np.float64).sum(axis=1)
     common = alpha[(alpha > 0.7) & (masks.ravel() == 0)]
     distance = np.abs(common[:, None] * feature - of_mask).sum(axis=1).mean()
     np.testing.assert_allclose(evidence.distance, [[distance]], rtol=1e-5)
@@ -146,7 +141,7 @@ def test_alone_sees_through_what_is_in_front() -> None:
     masks = np.full((37, 50), -1, np.int32)
     masks[10:28, 9:41] = 0
     view = View("v", camera(), masks, np.ones((1, 3), np.float32))
-    table = mask_table(gaussians, [view], NEAR)
+    table = table_of(gaussians, [view])
     colors = np.stack([RED, GREEN])
     alone = alone_evidence(gaussians, [view], NEAR, ids, colors, RED[None], 0.7)
     visible = visible_evidence(table, ids, colors, RED[None])
@@ -294,7 +289,7 @@ def test_rendered_masks_are_filled_from_covered_pixels() -> None:
     views = [View("v", turned(0.0), patches(turned(0.0)), np.ones((12, 3), np.float32))]
     values = np.random.default_rng(1).random((len(gaussians), 2), np.float32)
     means, pure = rendered_masks(gaussians, views, NEAR, values, 0.3)
-    weights, ids = pixel_weights(gaussians, views[0].camera, NEAR).toarray(), views[0].mask_map().ravel()
+    weights, ids = view_weights(gaussians, views[0].camera, NEAR).toarray(), views[0].mask_map().ravel()
     for mask in range(views[0].mask_count):
         pixels = (ids == mask) & (weights.sum(axis=1) >= 0.3)
         expected = (weights[pixels] @ values).mean(axis=0) if pixels.any() else np.zeros(2)

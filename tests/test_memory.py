@@ -22,7 +22,7 @@ from scipy.sparse import csr_array, random_array
 from test_fit import boxes_on_a_table
 from test_grouping import hand_table
 from test_membership import groups, on_a_line
-from test_visibility import NEAR, camera, cloud, view_of
+from test_visibility import NEAR, camera, cloud, table_of, view_of
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
@@ -30,7 +30,7 @@ from og_pointcloud.fitting import mask_table as mask_table_module
 from og_pointcloud.fitting import memory as memory_module
 from og_pointcloud.fitting import view_votes as votes_module
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.memory import (
     free_memory,
@@ -273,7 +273,7 @@ def gaussians() -> Gaussians:
 
 @pytest.fixture
 def expected(gaussians: Gaussians) -> MaskTable:
-    return mask_table(gaussians, views(), NEAR)
+    return table_of(gaussians, views())
 
 
 def assert_same(table: MaskTable, expected: MaskTable) -> None:
@@ -292,7 +292,7 @@ def test_a_table_on_disk_is_the_table_in_memory(gaussians: Gaussians, expected: 
     nbytes = sum(getattr(expected, name).nnz for name in MATRICES) * 8
     with WorkFolder.open(None) as work:
         work.hold(share * nbytes, np.inf)
-        table = mask_table(gaussians, views(), NEAR, work=work, most_in_memory=share * nbytes)
+        table = table_of(gaussians, views(), work=work, most_in_memory=share * nbytes)
     for name in MATRICES:
         matrix = getattr(table, name)
         assert in_file(matrix.data) == in_file(matrix.indices) == (share < 1)
@@ -303,17 +303,17 @@ def test_two_tables_in_a_temporary_folder_do_not_mix(gaussians: Gaussians, expec
     other = gaussians.take(np.arange(len(gaussians))[::-1])
     with WorkFolder.open(None) as work:
         work.hold(0, np.inf)  # all is written
-        assert_same(mask_table(gaussians, views(), NEAR, work=work), expected)
-        assert_same(mask_table(other, views(), NEAR, work=work), mask_table(other, views(), NEAR))
+        assert_same(table_of(gaussians, views(), work=work), expected)
+        assert_same(table_of(other, views(), work=work), table_of(other, views()))
 
 
 def test_what_is_not_kept_takes_no_fingerprint(
     gaussians: Gaussians, expected: MaskTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr("og_pointcloud.fitting.mask_table.fingerprint")
-    assert_same(mask_table(gaussians, views(), NEAR), expected)
+    assert_same(table_of(gaussians, views()), expected)
     with WorkFolder.open(tmp_path / "kept") as work, pytest.raises(NameError):
-        mask_table(gaussians, views(), NEAR, work=work)
+        table_of(gaussians, views(), work=work)
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -351,25 +351,25 @@ def killed_after(count: int, of: list[View]) -> Iterator[View]:
 def interrupted(folder: Path, gaussians: Gaussians, after: int = 4) -> int:
     """A table that is killed; how many views it keeps."""
     with pytest.raises(Killed), WorkFolder.open(folder) as work:
-        mask_table(gaussians, killed_after(after, views()), NEAR, work=work, side_by_side=1)
+        table_of(gaussians, killed_after(after, views()), work=work, side_by_side=1)
     return kept_files(folder)
 
 
 def resumed(folder: Path, gaussians: Gaussians, of: list[View]) -> MaskTable:
     with WorkFolder.open(folder) as work:
-        return mask_table(gaussians, of, NEAR, work=work, side_by_side=1)
+        return table_of(gaussians, of, work=work, side_by_side=1)
 
 
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Numbers of masks of every view that is rendered from now on."""
     counts: list[int] = []
-    plain = mask_table_module.view_weights
+    plain = mask_table_module.sightings
 
     def counting(*arguments: object, **options: object) -> object:
         counts.append(arguments[3])  # type: ignore[arg-type]
         return plain(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mask_table_module, "view_weights", counting)
+    monkeypatch.setattr(mask_table_module, "sightings", counting)
     return counts
 
 
@@ -405,7 +405,7 @@ def test_only_views_that_changed_are_rendered_again(
     counts = rendered(monkeypatch)
     table = resumed(tmp_path, gaussians, changed)
     assert len(counts) == again
-    assert_same(table, mask_table(gaussians, changed, NEAR))
+    assert_same(table, table_of(gaussians, changed))
 
 
 @pytest.mark.parametrize("change", ["xyz", "opacity", "near", "thickness"])
@@ -414,12 +414,11 @@ def test_views_of_another_geometry_are_not_taken(
 ) -> None:
     interrupted(tmp_path, gaussians)
     counts = rendered(monkeypatch)
-    options = {"thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)}}
     if change in ("xyz", "opacity"):
         gaussians = replace(gaussians, **{change: getattr(gaussians, change) * np.float32(0.9)})
     with WorkFolder.open(tmp_path) as work:
-        near = 2 * NEAR if change == "near" else NEAR
-        mask_table(gaussians, views(), near, work=work, side_by_side=1, **options.get(change, {}))  # type: ignore[arg-type]
+        other = {"near": {"near": 2 * NEAR}, "thickness": {"thickness": 0.2}}.get(change, {})
+        table_of(gaussians, views(), **other, work=work, side_by_side=1)
     assert len(counts) == 7
 
 
@@ -463,16 +462,15 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
 SLOW_FIT = """
 import sys, time
 import og_pointcloud as og
-from og_pointcloud.fitting import mask_table
-from og_pointcloud.settings import VisibilitySettings
+from og_pointcloud.fitting import fit, mask_table
 plain = mask_table.sightings
 def slow(*arguments):
     if arguments[6] is None:  # all points are asked: no trial of a size
         time.sleep(0.5)
     return plain(*arguments)
 mask_table.sightings = slow
-settings = og.FitSettings(visibility=VisibilitySettings(keep_after_s=0, views_share=0))
-og.fit(og.read_capture(sys.argv[1]), settings, work=sys.argv[2], progress=False)
+fit.KEEP_AFTER_S = fit.VIEWS_MEMORY_SHARE = 0
+og.fit(og.read_capture(sys.argv[1]), work=sys.argv[2], progress=False)
 """
 
 

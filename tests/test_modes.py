@@ -12,13 +12,14 @@ import pytest
 from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
+from og_pointcloud.fitting import fit as fit_module
 from og_pointcloud.fitting import labellers
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.labellers import LABELLERS, fast
 from og_pointcloud.fitting.learned.codebook import Codebook
 from og_pointcloud.journal import Journal, LeftOut, left_out_entry
-from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
+from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 PAPER = PaperSettings(schedule_share=0.004, k1=8, k2=2, feature_rate=0.02)
@@ -142,8 +143,8 @@ def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
 def test_a_killed_fit_in_paper_mode_continues_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
     scene = boxes_on_a_table().scene
-    visibility = VisibilitySettings(keep_after_s=0)  # else a short fit keeps nothing
-    settings = FitSettings(mode="paper", paper=replace(PAPER, schedule_share=0.0005), visibility=visibility)
+    monkeypatch.setattr(fit_module, "KEEP_AFTER_S", 0)  # else a short fit keeps nothing
+    settings = FitSettings(mode="paper", paper=replace(PAPER, schedule_share=0.0005))
     expected = fit(scene, settings, progress=False)
     monkeypatch.setattr(paper, "CHECKPOINT_SECONDS", 0)
     with monkeypatch.context() as patch:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import pixel_weights, reference_pixel_weights
+from reference_splatting import reference_pixel_weights
 from scenes import TinyCapture
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
@@ -27,7 +27,7 @@ from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.rendering.surface import stride_for_pixels
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import PaperSettings
@@ -85,7 +85,7 @@ def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch
     literal = torch.tensor(values, dtype=torch.float64, requires_grad=True)
     expected, masked = torch.zeros((), dtype=torch.float64), 0
     for view in balls.views:
-        weights = pixel_weights(balls.gaussians, view.camera, NEAR).toarray().astype(np.float64)
+        weights = view_weights(balls.gaussians, view.camera, NEAR).toarray().astype(np.float64)
         image, ids = torch.tensor(weights) @ literal, view.mask_map().ravel()
         members = [np.flatnonzero(ids == mask) for mask in range(view.mask_count)]
         means = [image[pixels].mean(dim=0) for pixels in members if len(pixels)]
@@ -450,7 +450,7 @@ def test_some_gaussians_drawn_alone_are_those_of_a_scene_of_them(balls: Balls) -
     alone = source.drawn(2, 0.5, 0, members)
     own = balls.gaussians.take(source.known[members])
     own = replace(own, scale=own.scale * np.float32(0.5))
-    weights = pixel_weights(own, balls.views[2].camera, NEAR).toarray()
+    weights = view_weights(own, balls.views[2].camera, NEAR).toarray()
     covered = (weights.sum(axis=1) >= SHORT.covered_share) & (balls.views[2].mask_map().ravel() >= 0)
     assert 0 < len(alone.mask) == covered.sum()
     np.testing.assert_allclose(alone.weights.toarray()[:, members], weights[covered], atol=1e-5)

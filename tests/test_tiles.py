@@ -22,9 +22,9 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting import tiles
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, _opened, split
 from og_pointcloud.fitting.work_folder import WorkFolder, kept_files
+from og_pointcloud.rendering.splatting import view_weights
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
@@ -216,7 +216,7 @@ def test_every_point_that_shows_is_points_to_draw(monkeypatch, tmp_path):
     drawing = tiles._Drawing(1.0, 0.1, 0.3)
     # So faint that nothing hides anything.
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32), 0.01)
-    shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
+    shows = np.unique(view_weights(everything, camera, drawing.near).indices)
     rows, larger, inside = tiles._points_to_draw(view, cloud, drawing)
     assert len(shows) > 250
     assert set(shows) <= set(rows)

@@ -26,13 +26,19 @@ from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
-from og_pointcloud.rendering.geometry import drawn_spacing, isotropic, thinned
+from og_pointcloud.rendering.geometry import drawn_spacing, isotropic
 from og_pointcloud.rendering.pixel_cells import typical_spacing
 from og_pointcloud.rendering.smoothing import smoothed
 from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings, fit_settings
+
+VIEWS_MEMORY_SHARE, TABLE_MEMORY_SHARE = 0.3, 0.4
+"""Shares of the memory left that views worked on side by side may fill (there is always one), and of the rest that the
+mask table may fill; a larger one is on disk. What is derived from it takes as much."""
+KEEP_AFTER_S = 20.0
+"""Finished views are kept for a restart only where all views together take longer than this, in seconds."""
 
 
 def fit(
@@ -188,7 +194,7 @@ def _with_edges(scene: Scene, journal: Journal) -> Scene:
 def _as_drawn(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
     """The surface with points as large as held-out views find best, and at smoothed positions."""
     # Mode paper draws points as full as trained Gaussians are.
-    if not surface.by_sight:
+    if settings.mode == "paper":
         return surface
     points = surface.scene.points
     spacing = drawn_spacing(points.xyz, surface.neighborhood)
@@ -204,24 +210,23 @@ def _as_drawn(surface: Surface, settings: FitSettings, journal: Journal) -> Surf
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:
     """The mask table of a surface, without what its masks show behind their objects. The table, and the views rendered
     at the same time, each stay within their share of the memory."""
-    visibility, views = settings.visibility, surface.scene.views
+    views = surface.scene.views
     with journal.stage("visibility"):
         # As many views at once as fit into their share, at least one; the table gets its share of the rest.
         left = memory_left(settings.memory)
         largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
         one_view = working_memory(len(surface.gaussians), largest)
-        at_once = int(np.clip(visibility.views_share * left // one_view, 1, min(get_num_threads(), len(views))))
-        most = visibility.table_share * max(0, left - at_once * one_view)
-        work.hold(most, visibility.keep_after_s)
+        at_once = int(np.clip(VIEWS_MEMORY_SHARE * left // one_view, 1, min(get_num_threads(), len(views))))
+        most = TABLE_MEMORY_SHARE * max(0, left - at_once * one_view)
+        work.hold(most, KEEP_AFTER_S)
         table = mask_table(
             surface.gaussians,
-            (thinned(view, surface.stride) for view in journal.steps(views, "visibility")),
+            journal.steps(views, "visibility"),
             surface.near,
             surface.thickness,
             work=work,
             side_by_side=at_once,
             most_in_memory=most,
-            by_sight=surface.by_sight,
         )
         journal.notes["table"] = {
             "views": len(views),
@@ -232,8 +237,6 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
         if work.found:  # views of an interrupted fit
             journal.leave_out(LeftOut.RENDERING, count=work.found, folder=work.place().name)
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
-        # Areas were counted in pixels of the thinned images.
-        table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
         table = front_surfaces(surface, table, settings, journal)
         if settings.mode == "paper":  # renders views again, and needs the masks of each
             return table
@@ -245,7 +248,6 @@ def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, jo
     """The table without what its masks show behind their objects (`without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
     poses = np.stack([camera.world_to_camera for camera in cameras])
-    # For the full images, like the masks' areas by now.
     focal = np.sqrt([camera.fx * camera.fy for camera in cameras])
     table, share = without_see_through(table, surface.gaussians, poses, focal, settings.membership)
     journal.notes["seen_through"] = round(share, 5)

@@ -83,7 +83,7 @@ def choose_scale(
     def tables_of(scale: float) -> list[MaskTable]:
         """The tables of the two halves of the views, with points of a scale."""
         drawn = isotropic(points, spacing, scale, geometry.opacity)
-        tables = (mask_table(drawn, half, near, thickness, by_sight=True, selected=selected) for half in halves)
+        tables = (mask_table(drawn, half, near, thickness, selected=selected) for half in halves)
         return [table.of_points(sample) for table in tables]
 
     judges = {scale: tables_of(scale) for scale in journal.steps(geometry.scales, "point size")}

@@ -128,7 +128,7 @@ def trained_by_rendering(
     options = settings.paper
     if options.k1 is None:
         options = replace(options, k1=thing_count(table))  # before training: a checkpoint's key holds the settings
-    drawn = surface.gaussians, surface.thinned_views(), surface.near, options
+    drawn = surface.gaussians, surface.scene.views, surface.near, options
     with journal.bars() as report:
         run = TrainingRun(settings.seed, report, work)
         with journal.stage("features"):
@@ -152,7 +152,7 @@ def leaves_of_training(
 ) -> Labelling:
     """The leaves of a trained codebook as instances, each with the masks that Eq. 5 accepts for it."""
     options, gaussians = settings.paper, surface.gaussians
-    near, views = surface.near, surface.thinned_views()
+    near, views = surface.near, surface.scene.views
     # Leaves with Gaussians become instances 0, 1, ...; some of the k1 k2 leaves have none.
     used, leaf = np.unique(book.leaf[book.leaf >= 0], return_inverse=True)
     ids = np.full(len(gaussians), -1, np.int32)

@@ -1,6 +1,6 @@
-"""Frozen geometry + views -> the mask table: how much each Gaussian shows in each mask of each view.
+"""Frozen geometry + views -> the mask table: how openly each mask of each view shows each point.
 
-One pass over each view (`splatting.view_weights`), several side by side. What a view shows goes to a `WorkFolder`,
+One pass over each view (`sightings.sightings`), several side by side. What a view shows goes to a `WorkFolder`,
 which writes it where memory is short or the work long; in the end the views are put together to one table. Views that
 an interrupted fit left in the folder are not rendered again.
 """
@@ -24,24 +24,20 @@ from og_pointcloud.fitting.memory import scratch_array
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.kernels import njit
 from og_pointcloud.rendering.sightings import sightings
-from og_pointcloud.rendering.splatting import Gaussians, ViewWeights, view_weights
-from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
+from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.scene import Scene, View
 
 Result = TypeVar("Result")
-
-SEEN_THROUGH_SHARE = 0.1
-"""Share of a weight seen through a surface that counts as exposure. Not 0, so that points that are only ever seen
-through a surface are still decided by the views that see them."""
 
 
 @dataclass(frozen=True)
 class MaskTable:
-    """What every mask of every view shows of every Gaussian, and what shows outside all masks.
+    """What every mask of every view shows of every point, and what shows outside all masks.
 
-    weights: (masks, n) sparse float32, blending weight of each Gaussian in each mask, in pixels; masks view by view.
+    weights: (masks, n) sparse float32, how openly each point shows in each mask; masks view by view.
     outside: (views, n) sparse float32, the same for each view's pixels without a mask.
-    exposure: (views, n) sparse float32, the part of each Gaussian's own splat that reaches the camera: about 1 in
-        front, small behind other splats, and smaller still where it only shows through a surface.
+    exposure: (views, n) sparse float32 in (0, 1], the light that reaches the camera from each point: 1 in front, little
+        behind others.
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
     mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks. names: (views,), of the views.
@@ -88,41 +84,38 @@ def mask_table(
     gaussians: Gaussians,
     views: Iterable[View],
     near: float,
-    thickness: NDArray[np.float32] | None = None,
+    thickness: NDArray[np.float32],
     *,
     work: WorkFolder | None = None,
     side_by_side: int | None = None,
     most_in_memory: float = np.inf,
-    by_sight: bool = False,
     selected: NDArray[np.bool_] | None = None,
 ) -> MaskTable:
     """The mask table of all views, one pass over each.
 
-    near: depth of the near plane, scene units. thickness: (n,) how far behind the surface in front of it a Gaussian may
-    lie and still belong to it, scene units; anything farther is seen through it and counts SEEN_THROUGH_SHARE. None:
-    all counts alike.
+    near: depth of the near plane, thickness: (n,) how far in front of a point others hide it, both in scene units.
     work: where the views are kept meanwhile; views that are there already are not rendered. None: in memory.
     side_by_side: maximum number of views worked on at once; None: the number of threads.
     most_in_memory: bytes of entries; a larger table is in mapped files.
-    by_sight: take what views see along each point's own ray (`sightings.sightings`), not what each Gaussian paints;
-    thickness is then as described there. selected: (n,) bool, the points that rays are cast to; None: all.
+    selected: (n,) bool, the points that rays are cast to; None: all.
     """
     if work is None:
         work = WorkFolder(None)
         work.hold(np.inf, np.inf)
     geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near)
     # What is not kept is not looked for by another run: it needs no fingerprint.
-    of_all = fingerprint(*geometry, by_sight, selected) if work.folder is not None else None
+    of_all = fingerprint(*geometry, selected) if work.folder is not None else None
 
     def shown(view: View) -> _ShownView:
         ids = view.mask_map()
         key = fingerprint(of_all, view_fingerprint(view, ids)) if of_all is not None else work.number()
 
         def make() -> tuple[NDArray[Any], ...]:
-            if not by_sight or thickness is None:
-                return _view_arrays(gaussians, view, ids, near, thickness)
+            """Numbers of entries of each row (masks + 1,), the last for pixels without a mask; the entries' columns and
+            values; and columns and values of the exposure."""
             seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, selected)
-            return _as_arrays(seen.rows, seen.openness)
+            rows, exposure = seen.rows, seen.openness
+            return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
 
         # Only a view's sizes are kept here: the work folder holds its entries, or writes them to a file.
         lengths, *_, exposed = work.arrays("view", key, make)
@@ -144,7 +137,7 @@ def mask_table(
 
 @dataclass(frozen=True)
 class _ShownView:
-    """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``, or ``make`` makes anew. sizes: (3,)
+    """A view whose arrays a work folder keeps under ``key``, or ``make`` makes anew. sizes: (3,)
     numbers of entries in masks, outside of them, and of the exposure. pixels: (masks,) int32, area of each. name,
     mask_features, mask_tracks: see `View`."""
 
@@ -162,41 +155,6 @@ def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
     camera = view.camera
     numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
     return fingerprint(numbers, camera.world_to_camera, ids)
-
-
-def _view_arrays(
-    gaussians: Gaussians,
-    view: View,
-    ids: NDArray[np.int32],
-    near: float,
-    thickness: NDArray[np.float32] | None,
-) -> tuple[NDArray[Any], ...]:
-    """What a view shows: numbers of entries of each row (masks + 1,), the last for pixels without a mask; the entries'
-    columns and values; and columns and values of the view's exposure."""
-    shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
-    exposure = _exposure(shown)
-    # Pixels that no photograph covers say nothing: a Gaussian with its center there is unseen, not outside of masks.
-    if (ids == NOT_SEEN).any():
-        seen = _photographed(gaussians.xyz, view.camera, ids).astype(np.float32)
-        for matrix in (shown.rows, exposure):
-            matrix.data *= seen[matrix.indices]
-            matrix.eliminate_zeros()
-    return _as_arrays(shown.rows, exposure)
-
-
-def _photographed(xyz: NDArray[np.float32], camera: Camera, ids: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(n,) bool: False for centers in pixels that are NOT_SEEN."""
-    uv_px, _ = camera.project(xyz)
-    inside = np.flatnonzero(camera.shows(uv_px))
-    column, row = uv_px[inside].astype(np.intp).T
-    seen = np.ones(len(xyz), np.bool_)
-    seen[inside] = ids[row, column] != NOT_SEEN
-    return seen
-
-
-def _as_arrays(rows: csr_array, exposure: csr_array) -> tuple[NDArray[Any], ...]:
-    """The arrays of a view as `_view_arrays` returns them."""
-    return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
 
 
 def _put_together(
@@ -343,17 +301,3 @@ def _side_by_side(
                 yield futures.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)  # interrupted, or a view failed: no more are begun
-
-
-def _exposure(view: ViewWeights) -> csr_array:
-    """(1, n) sparse: the weight of each Gaussian in a view, relative to its weight with nothing in front.
-
-    What shows through a surface counts SEEN_THROUGH_SHARE: the rest of what the view says is about the surface.
-    """
-    n = view.rows.shape[1]
-    seen = np.bincount(view.rows.indices, view.rows.data, n).astype(np.float64)  # integers where there is nothing
-    visible = np.flatnonzero(seen)
-    seen -= (1 - SEEN_THROUGH_SHARE) * np.bincount(view.through.indices, view.through.data, n)
-    # So little of a huge splat may be in the image that float32 would round it to 0.
-    part = np.clip(seen[visible] / view.area[visible], np.finfo(np.float32).tiny, 1).astype(np.float32)
-    return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, n))

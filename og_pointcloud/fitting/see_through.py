@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.holes import seen_through_holes
-from og_pointcloud.fitting.mask_table import SEEN_THROUGH_SHARE, MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import Gaussians, depth_and_slopes
 from og_pointcloud.settings import MembershipSettings
+
+SEEN_THROUGH_SHARE = 0.1
+"""Share of a weight seen through a hole that counts. Not 0, so that points that are only ever seen through holes are
+still decided by the views that see them."""
 
 
 def without_see_through(

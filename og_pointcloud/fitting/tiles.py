@@ -342,7 +342,7 @@ def _entries(
         return np.zeros(0, ENTRY), counts, np.zeros((2, COLOR_DIFFERENCE_BINS))
     splats = drawing.splats(cloud, rows, larger, settings.geometry.opacity)
     thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
-    table = mask_table(splats, [view], drawing.near, thickness, by_sight=True)
+    table = mask_table(splats, [view], drawing.near, thickness)
     camera = view.camera
     front, _ = without_see_through(
         table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership

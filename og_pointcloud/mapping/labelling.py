@@ -40,7 +40,7 @@ def labelled(map_: GrowingMap, rows: NDArray[np.int64], around: Neighborhood, se
     scene, geometry = Scene(points, views, map_.space.name, "map"), settings.geometry
     drawn = isotropic(points, spacing, map_.scale or geometry.middle_scale, geometry.opacity)
     near = near_plane(points.xyz, (view.camera for view in views))
-    surface = Surface(scene, None, around, drawn, near, thickness, 1, by_sight=True)
+    surface = Surface(scene, None, around, drawn, near, thickness)
     table = front_surfaces(surface, table, settings, journal)
     return fit_prepared(Prepared(scene, surface, table), settings, journal)
 

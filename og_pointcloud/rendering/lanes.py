@@ -66,10 +66,8 @@ def _operator(
 _operator(operator.add, LANES, LANES, "fadd")
 _operator(operator.sub, LANES, LANES, "fsub")
 _operator(operator.mul, LANES, LANES, "fmul")
-_operator(operator.lt, LANES, TRUTHS, "fcmp_ordered", "<")
 _operator(operator.gt, LANES, TRUTHS, "fcmp_ordered", ">")
 _operator(operator.ge, LANES, TRUTHS, "fcmp_ordered", ">=")
-_operator(operator.and_, TRUTHS, TRUTHS, "and_")
 
 
 def _all(value: float, vector: ir.VectorType = FLOATS) -> ir.Constant:
@@ -178,18 +176,3 @@ def exp2(context: Any, lanes: Any) -> Any:
         return builder.fmul(value, builder.bitcast(exponent, FLOATS))
 
     return LANES(LANES), generate
-
-
-@intrinsic
-def lane_sum(context: Any, lanes: Any) -> Any:
-    """The sum of all lanes, float32: halves are added until one number is left."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        value, count = arguments[0], WIDTH
-        while count > 1:
-            count //= 2
-            halves = [ir.Constant(ir.VectorType(INT, count), [h * count + k for k in range(count)]) for h in (0, 1)]
-            value = builder.fadd(*(builder.shuffle_vector(value, value, half) for half in halves))
-        return builder.extract_element(value, ir.Constant(INT, 0))
-
-    return types.float32(LANES), generate

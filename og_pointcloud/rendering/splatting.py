@@ -1,17 +1,9 @@
-"""Frozen geometry + camera + id map -> how much each Gaussian shows in each id's pixels, exactly as 3DGS blends.
+"""Frozen geometry + camera -> how much of each pixel each Gaussian paints, exactly as 3DGS blends.
 
 Rendering a frozen scene is linear: a pixel's value is ``sum_g W[p, g] value_g`` with the alpha-blending weights
-``W[p, g] = T alpha`` of 3D Gaussian Splatting (Kerbl et al. 2023, Eq. 3; paper appendix "splatting"). This file adds
-those weights up over the pixels of each mask, tile by tile while compositing; ``W`` itself is never stored:
-
-    A[i, g] = sum over pixels p of mask i of W[p, g]
-
-It knows nothing of colors or features: a view of any value is a product with these sparse rows. With an id map that
-gives every pixel its own id, ``A`` is ``W`` itself.
-
-Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces
-are, exposure counts little of what shows *through* one: splats farther than that behind the splat at which a pixel
-became more than half covered. It is a depth test with the accuracy of a surface, and takes no second pass.
+``W[p, g] = T alpha`` of 3D Gaussian Splatting (Kerbl et al. 2023, Eq. 3; paper appendix "splatting"). This file
+computes those weights, tile by tile. It knows nothing of colors, features or masks: a view of any value is a product
+with them.
 """
 
 from __future__ import annotations
@@ -26,7 +18,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.lanes import WIDTH, any_of, broadcast, exp2, iota, lane_sum, load, minimum, select, store
+from og_pointcloud.rendering.lanes import WIDTH, any_of, broadcast, exp2, iota, load, minimum, select, store
 from og_pointcloud.scene import Camera, Points
 
 TILE = WIDTH
@@ -35,7 +27,7 @@ GAUSSIANS_PER_BOX = 64
 """Consecutive Gaussians that share a bounding box and are culled together."""
 BATCH = 128
 """Splats of a tile that are fetched together."""
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+ZERO, ONE = np.float32(0), np.float32(1)
 LOW_PASS = 0.3
 """Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
 ALPHA_MIN = 1.0 / 255.0
@@ -94,11 +86,9 @@ def render(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Values (n, c) of the Gaussians as one view shows them: (H, W, c) float32, and (H, W) float32, how much of each
     pixel is covered. Uncovered pixels are 0: this is ``W @ values`` without storing ``W``."""
-    pixels = camera.width * camera.height
-    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    (rows, cols, weights, first, counts), _ = _entries(gaussians, camera, ids, pixels, near, None)
+    row = np.arange(camera.width * camera.height, dtype=np.int32).reshape(camera.height, camera.width)
     with_coverage = np.concatenate([values, np.ones((len(values), 1), np.float32)], axis=1)
-    image = _paint(rows, cols, weights, first, counts, with_coverage, pixels).reshape(camera.height, camera.width, -1)
+    image = _paint(*_entries(gaussians, camera, row, near), with_coverage, row.size).reshape(*row.shape, -1)
     return image[..., :-1], image[..., -1]
 
 
@@ -108,86 +98,51 @@ def _paint(rows, cols, weights, first, counts, values, pixels):  # noqa: ANN001,
     image = np.zeros((pixels, values.shape[1]), np.float32)
     for tile in prange(len(counts)):
         for e in range(first[tile], first[tile] + counts[tile]):
-            for c in range(values.shape[1] if rows[e] < pixels else 0):
+            for c in range(values.shape[1]):
                 image[rows[e], c] += weights[e] * values[cols[e], c]
     return image
 
 
-@dataclass(frozen=True)
-class ViewWeights:
-    """What one view shows. rows: (id_count + 1, n) sparse float32 without duplicates, the last row what shows in pixels
-    with id -1; they sum to at most the id's area in pixels. area: (n,) float64, each splat's weight in pixels with
-    nothing in front of it, 0 where it is outside the image. through: (1, n) sparse float32, the part of a splat's
-    weight that shows through a surface."""
-
-    rows: csr_array
-    area: NDArray[np.float64]
-    through: csr_array
-
-
 def view_weights(
-    gaussians: Gaussians,
-    camera: Camera,
-    ids: NDArray[np.int32],
-    id_count: int,
-    near: float,
-    thickness: NDArray[np.float32] | None = None,
-) -> ViewWeights:
-    """Blending weight of every Gaussian summed over the pixels of every id of one view.
+    gaussians: Gaussians, camera: Camera, near: float, wanted: NDArray[np.bool_] | None = None
+) -> csr_array:
+    """W of one view: (pixels, n) sparse float32, row by row of the image, a pixel's nearest Gaussian first.
 
-    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `mask_table.mask_table`.
-    Splats are blended by (float32 depth, index), so that equal depths have one order.
+    wanted: (H, W), H and W the camera's: the pixels that have a row; None: all. Splats are blended by (float32 depth,
+    index), so that equal depths have one order.
     """
-    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness)
-    data, indices, indptr = _merge(rows, cols, weights, first, counts, id_count + 2, len(gaussians))
-    border, n = indptr[-2], len(gaussians)
-    return ViewWeights(
-        csr_array((data[:border], indices[:border], indptr[:-1]), shape=(id_count + 1, n)),
-        area,
-        csr_array((data[border:], indices[border:], indptr[-2:] - border), shape=(1, n)),
-    )
+    wanted = np.ones((camera.height, camera.width), np.bool_) if wanted is None else wanted
+    number = np.cumsum(wanted, dtype=np.int32)
+    row = np.where(wanted, number.reshape(wanted.shape) - 1, np.int32(-1))
+    entries = _by_row(*_entries(gaussians, camera, row, near), number[-1])
+    return csr_array(entries, shape=(number[-1], len(gaussians)))
 
 
 def working_memory(n: int, camera: Camera) -> int:
-    """About how many bytes `view_weights` holds at once for n Gaussians and that image."""
+    """About how many bytes a view of n Gaussians takes while it is drawn or traced (sightings.py)."""
     return 250 * n + 60 * camera.width * camera.height
 
 
-def _entries(
-    gaussians: Gaussians,
-    camera: Camera,
-    ids: NDArray[np.int32],
-    id_count: int,
-    near: float,
-    thickness: NDArray[np.float32] | None,
-) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
-    """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), where tile t has the entries
-    first[t] : first[t] + counts[t]; and the area of each splat."""
-    area = np.zeros(len(gaussians))
-    binned = binned_splats(gaussians, camera, near, thickness, area)
-    masks = np.where(ids < 0, id_count, ids).astype(np.int32)
-    bounds = _entry_bounds(binned, masks, id_count)
-    first = np.concatenate([[0], np.cumsum(bounds)])
-    rows, cols, weights, counts = _composite(binned, masks, id_count, first, get_num_threads())
-    return (rows, cols, weights, first[:-1], counts), area
+def _entries(gaussians: Gaussians, camera: Camera, row: NDArray[np.int32], near: float) -> tuple[NDArray[Any], ...]:
+    """The entries of W, tile by tile: (rows, cols, weights, first, counts), where tile t has those from first[t] to
+    first[t] + counts[t]. row: (H, W) of each pixel, -1 for those that are left out."""
+    binned = binned_splats(gaussians, camera, near)
+    first = np.concatenate([[0], np.cumsum(_entry_bounds(binned, row))])
+    rows, cols, weights, counts = _composite(binned, row, first, get_num_threads())
+    return rows, cols, weights, first[:-1], counts
 
 
 def binned_splats(
-    gaussians: Gaussians,
-    camera: Camera,
-    near: float,
-    thickness: NDArray[np.float32] | None,
-    area: NDArray[np.float64] | None = None,
+    gaussians: Gaussians, camera: Camera, near: float, thickness: NDArray[np.float32] | None = None
 ) -> Binned:
-    """The splats of an image by tile. area: (n,), to be filled in for Gaussians with a splat; None: not computed."""
-    n, area = len(gaussians), np.empty(0) if area is None else area
-    thickness = np.full(n, np.inf, np.float32) if thickness is None else thickness
+    """The splats of an image by tile. thickness: (n,) how far in front of each its surface begins; None: not needed."""
+    thickness = np.zeros(len(gaussians), np.float32) if thickness is None else thickness
     shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
     rows = np.flatnonzero(_in_frustum(gaussians.xyz, gaussians.scale, gaussians.boxes, _frustum_planes(seen_by)))
     splats = _records(len(rows))
-    order = ascending(_project(rows, shapes, seen_by, splats, area))
+    order = ascending(_project(rows, shapes, seen_by, splats))
     # In order of depth in memory too: a tile's splats are then read from front to back.
     splats = _in_order(splats, order, _records(len(order)))
     columns = -(-camera.width // TILE)
@@ -305,11 +260,10 @@ def _in_frustum(xyz, scale, boxes, borders):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(rows, shapes, seen_by, splats, area):  # noqa: ANN001, ANN202
-    """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
-    weight in pixels if nothing were in front, or (0,) if not needed; returns keys (rows,) uint32: the bits of the
-    float32 depth, which sort as depths do since these are positive; CULLED for those without a pixel.
-    """
+def _project(rows, shapes, seen_by, splats):  # noqa: ANN001, ANN202
+    """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,); returns keys (rows,)
+    uint32: the bits of the float32 depth, which sort as depths do since these are positive; CULLED for those without a
+    pixel."""
     keys = np.full(len(rows), CULLED)
     (xyz, scale, rotation, opacity, thickness), (pose, intrinsics, size, near) = shapes, seen_by
     fx, fy, cx, cy = intrinsics
@@ -320,9 +274,9 @@ def _project(rows, shapes, seen_by, splats, area):  # noqa: ANN001, ANN202
             continue
         jx, jy = clamped_slopes(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale, rotation, g, pose, fx / depth, fy / depth, jx, jy)
-        u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
+        u, v = fx * tx + cx, fy * ty + cy
         # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
-        peak = np.log2(sigma)
+        peak = np.log2(np.float64(opacity[g]))
         reach = 2.0 / LOG2_E * (peak - LOG2_ALPHA_MIN)
         rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
         x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
@@ -334,8 +288,6 @@ def _project(rows, shapes, seen_by, splats, area):  # noqa: ANN001, ANN202
         s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
         s.peak, s.depth, s.surface = peak, depth, depth - thickness[g]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
-        if len(area):
-            area[g] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)  # the integral of alpha over that ellipse
         keys[i] = np.float32(depth).view(np.uint32)
     return keys
 
@@ -467,79 +419,51 @@ def _clip_box(s, left, top):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _entry_bounds(binned, masks, id_count):  # noqa: ANN001, ANN202
-    """An upper bound of the (mask, Gaussian) entries each tile will write."""
+def _entry_bounds(binned, row):  # noqa: ANN001, ANN202
+    """An upper bound of the entries that each tile will write."""
     splats, starts, members, columns = binned
-    tiles = len(starts) - 1
-    height, width = masks.shape
-    bounds = np.zeros(tiles, np.int64)
-    for tile in prange(tiles):
+    bounds = np.zeros(len(starts) - 1, np.int64)
+    for tile in prange(len(bounds)):
         left, top = tile % columns * TILE, tile // columns * TILE
-        distinct, last = 0, -1
-        for y in range(top, min(top + TILE, height)):
-            for x in range(left, min(left + TILE, width)):
-                # Runs of equal ids along rows: at least the number of distinct ids, without a set.
-                if masks[y, x] != last:
-                    distinct, last = distinct + 1, masks[y, x]
-        if distinct <= 4:
-            # A tighter bound, splat by splat, would save little memory here.
-            bounds[tile] = (distinct + 1) * (starts[tile + 1] - starts[tile])
-            continue
-        total = 0
-        for m in range(starts[tile], starts[tile + 1]):
+        pixels = np.count_nonzero(row[top : top + TILE, left : left + TILE] >= 0)
+        for m in range(starts[tile], starts[tile + 1] if pixels else starts[tile]):
             x0, x1, y0, y1 = _clip_box(splats[members[m]], left, top)
-            total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0)) + 1
-        bounds[tile] = total
+            bounds[tile] += min(pixels, (x1 - x0) * (y1 - y0))
     return bounds
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _composite(binned, masks, id_count, first, workers):  # noqa: ANN001, ANN202
-    """Blend every tile front to back and sum each splat's weights by mask; entries of tile t start at first[t].
-
-    Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
+def _composite(binned, row, first, workers):  # noqa: ANN001, ANN202
+    """Blend every tile front to back; entries of tile t start at first[t]."""
     splats, starts, members, columns = binned
     tiles = len(starts) - 1
     rows = np.empty(first[-1], np.int32)
     cols = np.empty(first[-1], np.int32)
     weights = np.empty(first[-1], np.float32)
     counts = np.zeros(tiles, np.int64)
-    sums = np.zeros((workers, id_count + 1))
-    # Each worker takes every workers-th tile (neighboring tiles cost alike, so the shares are even) and adds up in
-    # scratch rows of its own.
+    # Each worker takes every workers-th tile: neighboring tiles cost alike, so the shares are even.
     for worker in prange(workers):
-        sum_of, touched = sums[worker], np.empty(TILE * TILE, np.int32)
-        light, surface, shown = tile_buffer(), tile_buffer(), tile_buffer()
-        runs = np.empty((TILE, TILE), np.uint8)
-        batch = np.empty(BATCH, SPLAT)
+        light, shown, batch = tile_buffer(), tile_buffer(), np.empty(BATCH, SPLAT)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
-            ids = masks[top : top + TILE, left : left + TILE]
-            is_one_mask = _begin_tile(ids, light, surface, runs)
+            pixels = row[top : top + TILE, left : left + TILE]
+            _begin_tile(pixels, light)
             entry = first[tile]
             for begin in range(starts[tile], starts[tile + 1], BATCH):
+                if not has_light(light, LEAST_LIGHT):
+                    break
                 count = min(BATCH, starts[tile + 1] - begin)
                 for k in range(count):  # scattered in memory: fetched together, they do not wait for each other
                     batch[k] = splats[members[begin + k]]
                 for k in range(count):
-                    s = batch[k]
-                    weight, through = _blend(s, left, top, light, surface, shown)
-                    if weight == 0.0:
-                        continue
-                    box = _clip_box(s, left, top)
-                    if is_one_mask or _shows_one_mask(ids, runs, box):
-                        rows[entry], cols[entry], weights[entry] = ids[box[2], box[0]], s.gaussian, weight
-                        entry += 1
-                    else:
-                        for j in range(_add_by_mask(ids, shown, box, sum_of, touched)):
-                            rows[entry], cols[entry], weights[entry] = touched[j], s.gaussian, sum_of[touched[j]]
-                            sum_of[touched[j]] = 0.0
-                            entry += 1
-                    if through > 0.0:
-                        rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
-                        entry += 1
-                if not has_light(light, LEAST_LIGHT):
-                    break
+                    _blend(batch[k], left, top, light, shown)
+                    x0, x1, y0, y1 = _clip_box(batch[k], left, top)
+                    for y in range(y0, y1):
+                        for x in range(x0, x1):
+                            if shown[y * TILE + x] > 0:
+                                rows[entry], cols[entry] = pixels[y, x], batch[k].gaussian
+                                weights[entry] = shown[y * TILE + x]
+                                entry += 1
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts
 
@@ -553,21 +477,13 @@ def tile_buffer():  # noqa: ANN201
 
 
 @njit(cache=True, nogil=True)
-def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
-    """Set light to 1 and surface to infinity; pixels of a tile outside the image get no light. runs: (TILE, TILE), set
-    to how many pixels from each one to the right have its id. Returns whether all pixels have one id."""
-    one = True
+def _begin_tile(pixels, light):  # noqa: ANN001, ANN202
+    """Set light to 1 in pixels that have a row, and to 0 in others and outside the image."""
     light[:] = np.float32(0)
-    surface[:] = np.float32(np.inf)
-    height, width = ids.shape
-    for y in range(height):
-        run = 0
-        for x in range(width - 1, -1, -1):
-            run = run + 1 if x + 1 < width and ids[y, x] == ids[y, x + 1] else 1
-            runs[y, x] = run
-            light[y * TILE + x] = np.float32(1)
-        one &= run == width and ids[y, 0] == ids[0, 0]
-    return one
+    for y in range(pixels.shape[0]):
+        for x in range(pixels.shape[1]):
+            if pixels[y, x] >= 0:
+                light[y * TILE + x] = np.float32(1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -584,31 +500,18 @@ def _alpha_of_row(s, left, row):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blend(s, left, top, light, surface, shown):  # noqa: ANN001, ANN202
-    """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and its part shown through a surface.
-
-    light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
-    transmittance below a half. shown: set to the weights in the rows of its box.
-    """
-    none, full, half, never = broadcast(ZERO), broadcast(ONE), broadcast(HALF), broadcast(np.float32(np.inf))
-    depth, near_side = broadcast(s.depth), broadcast(s.surface)
-    weight, through = none, none
+def _blend(s, left, top, light, shown):  # noqa: ANN001, ANN202
+    """Draw a splat into a tile, a row of pixels at a time. light: transmittance of each pixel, 0 where it is finished.
+    shown: set to the splat's weights in the rows of its box."""
+    none, full = broadcast(ZERO), broadcast(ONE)
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
         alpha = _alpha_of_row(s, left, top + y)
         # Weight = transmittance before the splat times alpha, except in pixels that this splat would finish.
         before = load(light, y * TILE)
         after = before * (full - alpha)
         goes_on = after >= broadcast(LEAST_LIGHT)  # also where it is not covered and not finished
-        here = select(goes_on, before * alpha, none)
+        store(shown, y * TILE, select(goes_on, before * alpha, none))
         store(light, y * TILE, select(goes_on, after, none))
-        # The splat at which the transmittance falls below a half is the pixel's surface.
-        passed = select((before >= half) & (after < half), depth, never)
-        front = minimum(load(surface, y * TILE), passed)
-        store(surface, y * TILE, front)
-        store(shown, y * TILE, here)
-        weight = weight + here
-        through = through + select(near_side > front, here, none)
-    return lane_sum(weight), lane_sum(through)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -617,33 +520,6 @@ def attenuate(s, left, top, light):  # noqa: ANN001, ANN201
     full = broadcast(ONE)
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
         store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y)))
-
-
-@njit(cache=True, nogil=True)
-def _shows_one_mask(ids, runs, box):  # noqa: ANN001, ANN202
-    """Whether all pixels of a box have one id."""
-    x0, x1, y0, y1 = box
-    one = True
-    for y in range(y0, y1):
-        one &= runs[y, x0] >= x1 - x0 and ids[y, x0] == ids[y0, x0]
-    return one
-
-
-@njit(cache=True, nogil=True)
-def _add_by_mask(ids, shown, box, sum_of, touched):  # noqa: ANN001, ANN202
-    """Sum the weights of a box by id; returns how many ids were touched, and writes them to ``touched``."""
-    touches = 0
-    x0, x1, y0, y1 = box
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            weight = shown[y * TILE + x]
-            if weight > 0.0:
-                mask = ids[y, x]
-                if sum_of[mask] == 0.0:
-                    touched[touches] = mask
-                    touches += 1
-                sum_of[mask] += weight
-    return touches
 
 
 @njit(cache=True, nogil=True)
@@ -657,36 +533,18 @@ def has_light(light, least):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
-    """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
-    # A counting sort by row: tiles stay in order within a row.
-    start = np.zeros(row_count + 1, np.int64)
+def _by_row(rows, cols, weights, first, counts, row_count):  # noqa: ANN001, ANN202
+    """Tiles' entries as CSR (data, indices, indptr), by a counting sort: a pixel's entries stay in their order."""
+    start = np.zeros(row_count + 1, np.int32)
     for tile in range(len(first)):
         for e in range(first[tile], first[tile] + counts[tile]):
             start[rows[e] + 1] += 1
-    start = np.cumsum(start)
+    start = np.cumsum(start).astype(np.int32)
     place = start[:-1].copy()
-    sorted_cols = np.empty(start[-1], np.int32)
-    sorted_weights = np.empty(start[-1], np.float32)
+    sorted_cols, sorted_weights = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
     for tile in range(len(first)):
         for e in range(first[tile], first[tile] + counts[tile]):
             p = place[rows[e]]
             sorted_cols[p], sorted_weights[p] = cols[e], weights[e]
             place[rows[e]] = p + 1
-    # A Gaussian over a tile border has an entry from each tile: merge them, row by row.
-    # ``where`` holds a Gaussian's place in the output; a place before this row's begin is from an earlier row.
-    where = np.full(n, -1, np.int64)
-    indptr = np.zeros(row_count + 1, np.int32)
-    out = 0
-    for row in range(row_count):
-        begin = out
-        for p in range(start[row], start[row + 1]):
-            g = sorted_cols[p]
-            if where[g] >= begin:
-                sorted_weights[where[g]] += sorted_weights[p]
-            else:
-                where[g] = out
-                sorted_cols[out], sorted_weights[out] = g, sorted_weights[p]
-                out += 1
-        indptr[row + 1] = out
-    return sorted_weights[:out].copy(), sorted_cols[:out].copy(), indptr
+    return sorted_weights, sorted_cols, start

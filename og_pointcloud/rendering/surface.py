@@ -31,15 +31,12 @@ class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
     scene: with the points that are needed (`with_needed_points`; in mode paper all Gaussians stay), in Morton order; n
-    points, at the positions at which they are drawn (smoothing.py).
+    points, at the positions at which they are drawn (smoothing.py). In mode paper large images are thinned.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here,
     in the same order.
     neighborhood: spacing and neighbors of the n points as measured. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
-    thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
-    stride: every stride-th row and column of the images is used; 1 except in mode paper.
-    by_sight: views assign points to masks along each point's own ray (sightings.py); else, in mode paper, by how much
-    each Gaussian paints of each mask (splatting.py).
+    thickness: (n,) float32, `sight_thickness`, scene units.
     """
 
     scene: Scene
@@ -48,16 +45,10 @@ class Surface:
     gaussians: Gaussians
     near: float
     thickness: NDArray[np.float32]
-    stride: int
-    by_sight: bool = False
 
     def of_points(self, values: NDArray[Any]) -> NDArray[Any]:
         """Values (n, ...) of the points here, for each point of the whole scene."""
         return values if self.row_of_point is None else values[self.row_of_point]
-
-    def thinned_views(self) -> list[View]:
-        """The views at the resolution that is used, without their images."""
-        return [thinned(view, self.stride) for view in self.scene.views]
 
 
 def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -> Surface:
@@ -77,10 +68,10 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, settings, journal)
         thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), settings.geometry)
-        thickness = _blended_thickness(gaussians, thickness) if is_paper else thickness
-        # Only mode paper renders a view more than once.
-        stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal) if is_paper else 1
-    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, not is_paper)
+        if is_paper:  # which renders a view more than once
+            stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal)
+            scene = replace(scene, views=tuple(thinned(view, stride) for view in scene.views))
+    return Surface(scene, row_of_point, around, gaussians, near, thickness)
 
 
 def with_needed_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
@@ -143,14 +134,6 @@ def sight_thickness(
     """(n,) how far in front of a point others must lie to hide it, scene units: the thickness that noise and overlap
     give a surface. It follows from the point's spacing, or the typical one if that is larger."""
     return (settings.sight_thickness * np.maximum(spacing, typical_spacing)).astype(np.float32)
-
-
-def _blended_thickness(gaussians: Gaussians, thickness: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n,) how far behind the front of its surface a blended Gaussian may lie. thickness: (n,) `sight_thickness`."""
-    # Blending finds the front of a surface where a pixel is half covered, which may be anywhere within its thickness:
-    # hence twice the thickness; and a splat reaches three standard deviations beyond its center.
-    with np.errstate(over="ignore"):  # a splat near float32's largest is infinitely thick
-        return 2 * thickness + 3 * gaussians.scale.max(axis=1)
 
 
 def stride_for_pixels(views: Sequence[View], max_pixels: int, journal: Journal) -> int:

@@ -48,6 +48,13 @@ def scale(deviation: float) -> Answer:
 
 
 @agrees(WEIGHTS)
+def wider_than_the_image() -> Answer:
+    """Faint ones, many times as wide as the image."""
+    scale, opacity = np.full((10, 3), 50, np.float32), np.full(10, 0.2, np.float32)
+    return splatted(replace(scatter(), scale=scale, opacity=opacity), camera())
+
+
+@agrees(WEIGHTS)
 def scale_zero() -> Answer:
     """Standard deviation exactly 0, in one axis or in all: a splat is never smaller than about a pixel."""
     gaussians = scatter()

@@ -9,7 +9,7 @@ import numpy as np
 from labelled_clouds import unit_rows
 from numpy.typing import ArrayLike, NDArray
 from pinhole import looking
-from reference_splatting import pixel_weights, reference_pixel_weights, round_splats
+from reference_splatting import reference_pixel_weights, round_splats
 from scenes import ray_cast, write_scene
 from scipy.sparse import csr_array
 
@@ -18,7 +18,7 @@ from hard_cases.case import Answer
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.poses import in_local_frame, rigid
-from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 __all__ = [
@@ -69,7 +69,7 @@ def solid(xyz: NDArray[np.float32]) -> Gaussians:
 
 def dense_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
     """The library's blending weights, (H, W, n)."""
-    return pixel_weights(gaussians, view, near).toarray().reshape(view.height, view.width, len(gaussians))
+    return view_weights(gaussians, view, near).toarray().reshape(view.height, view.width, len(gaussians))
 
 
 def splatted(gaussians: Gaussians, view: Camera, near: float = NEAR, naive_near: float | None = None) -> Answer:

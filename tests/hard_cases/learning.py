@@ -21,7 +21,7 @@ from og_pointcloud.scene import Points, Scene
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, PaperSettings
 
 MASKS, EACH = 3, 200
-RAW = FeatureSettings(intra=False, normalize=False)
+EQ2_ALONE = FeatureSettings(intra=False)
 
 
 @agrees(1e-6, "distance of two mask means", powers(0, -7, -1))
@@ -31,7 +31,7 @@ def eq2_gradient(distance: float) -> Answer:
     weights = np.ones((MASKS, 600), np.float32)
     weights += (distance * np.random.default_rng(1).normal(size=weights.shape) * 10).astype(np.float32)
     weights = np.abs(weights)
-    _, gradient = FeatureObjective(mask_table_of(weights, [0] * MASKS), RAW).at(features, closest=0)
+    _, gradient = FeatureObjective(mask_table_of(weights, [0] * MASKS), EQ2_ALONE).at(features, closest=0)
     size = weights.astype(np.longdouble).sum(axis=1, keepdims=True)
     means = weights.astype(np.longdouble) @ features / size
     pull = np.zeros_like(means)

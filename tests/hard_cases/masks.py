@@ -7,9 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from reference_splatting import reference_view_weights
 
-from hard_cases import naive
 from hard_cases.case import Answer, agrees, powers, refuses
 from hard_cases.inputs import NEAR, by_ball, camera, scatter, two_balls, unit_rows
 from og_pointcloud.cloud import UNOBSERVED
@@ -22,32 +20,13 @@ from og_pointcloud.settings import FitSettings
 
 @agrees(1e-6, "masks in the view", (0, *powers(0, 4)))
 def mask_count(count: float) -> Answer:
-    """None, the whole image as one mask, ... every one of 10,000 pixels as its own."""
-    masks, large, gaussians = int(count), camera(100, 100, 90.0), scatter(20)
+    """None, the whole image as one mask, ... every one of 10,000 pixels as its own: votes on a point add up to what
+    the view sees of it."""
+    masks, large, gaussians = int(count), camera(100, 100, 90.0), scatter(200)
     ids = np.full(10_000, -1, np.int32) if masks == 0 else (np.arange(10_000) * masks // 10_000).astype(np.int32)
-    ids = ids.reshape(100, 100)
-    table = mask_table(gaussians, [View("one", large, ids, np.zeros((masks, 4), np.float32))], NEAR)
-    exact = reference_view_weights(gaussians, large, ids, masks, NEAR)
-    parts = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity
-
-    def plain() -> NDArray[np.floating]:
-        sums = np.zeros((masks + 1, len(gaussians)), np.float32)
-        np.add.at(sums, ids.ravel(), naive.pixel_weights(*parts, large, NEAR).reshape(10_000, -1))
-        return sums
-
-    ours = np.concatenate([table.weights.toarray().reshape(masks, 20), table.outside.toarray()])
-    return Answer(ours, exact, plain)
-
-
-@agrees(1e-6)
-def gaussians_wider_than_the_image() -> Answer:
-    """Masks of one pixel, of a row and of the rest, under Gaussians many times as wide as the image."""
-    gaussians = replace(scatter(), scale=np.full((10, 3), 50, np.float32), opacity=np.full(10, 0.2, np.float32))
-    ids = np.full((18, 24), -1, np.int32)
-    ids[9, 12], ids[3], ids[10:, 2:] = 0, 1, 2
-    table = mask_table(gaussians, [View("one", camera(), ids, np.zeros((3, 4), np.float32))], NEAR)
-    ours = np.concatenate([table.weights.toarray(), table.outside.toarray()])
-    return Answer(ours, reference_view_weights(gaussians, camera(), ids, 3, NEAR))
+    view = View("one", large, ids.reshape(100, 100), np.zeros((masks, 4), np.float32))
+    table = mask_table(gaussians, [view], NEAR, np.full(200, 0.1, np.float32))
+    return Answer(table.weights.sum(axis=0) + table.outside.sum(axis=0), table.exposure.sum(axis=0))
 
 
 @refuses(SceneError, "none of the 5 views has a mask", "expected at least one", "make masks first")

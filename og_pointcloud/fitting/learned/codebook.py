@@ -70,10 +70,8 @@ def two_level_codebook(
     coarse[taking_part], k1 = _clusters(placed, mass, k1, settings.rounds, rng)
 
     # Fine: as many as one view has masks in the cluster, so that a cluster that holds one thing stays whole.
-    fine_count = np.ones(k1, np.int64)
-    if settings.levels == 2:
-        together = things_together(table, coarse, k1, settings)
-        fine_count = np.minimum(together, settings.k2) if settings.k2 else together
+    together = things_together(table, coarse, k1, settings)
+    fine_count = np.minimum(together, settings.k2) if settings.k2 else together
     leaf_coarse: list[int] = []
     for cluster in range(k1):
         members = np.flatnonzero(coarse[taking_part] == cluster)

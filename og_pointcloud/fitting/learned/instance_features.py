@@ -17,8 +17,7 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
     all N_i. By Jensen's inequality the sum bounds that over pixels of ``|M_p - a_p Mbar_i|^2``, where a_p is the
     pixel's coverage: the printed loss where a_p = 1. It is stricter: each Gaussian must agree, not only each blend.
 
-Divided by P, Eq. 1 weighs the same at any image size; otherwise it is the paper's sum over a random view. With raw
-features its weight only sets their scale: Eq. 1 grows with the square of the scale, Eq. 2 falls with it.
+Divided by P, Eq. 1 weighs the same at any image size; otherwise it is the paper's sum over a random view.
 """
 
 from __future__ import annotations
@@ -100,22 +99,18 @@ def learn_features(table: MaskTable, settings: FeatureSettings | None = None, se
         raw, objective, converged = _minimise(problem, raw, closest, tolerance, settings.max_steps - steps)
         steps += len(objective) - 1
     features = np.zeros((table.weights.shape[1], settings.width), np.float32)
-    features[problem.shown] = read_features(raw, settings.normalize)
+    features[problem.shown] = read_features(raw)
     return LearnedFeatures(features, problem.seen, np.array(objective), steps, converged)
 
 
-def read_features(raw: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
-    """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
-
-    Without the ball, raw features would grow without bound: Eq. 2 alone is smallest at infinity, and Eq. 1 limits it
-    only where masks share Gaussians. A zero row has no direction; normalized, it reads 0.5.
-    """
-    return _read(raw, normalize, _columns(raw))
+def read_features(raw: NDArray[np.floating]) -> NDArray[np.floating]:
+    """What the losses see of a raw feature (n, width): its direction mapped to [0, 1]; of a zero row, 0.5."""
+    return _read(raw, _columns(raw))
 
 
-def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalize: bool) -> NDArray[np.floating]:
+def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating]) -> NDArray[np.floating]:
     """The gradient with respect to raw features (n, width), given that with respect to their `read_features`."""
-    return _raw_gradient(raw, gradient, normalize, _columns(raw))
+    return _raw_gradient(raw, gradient, _columns(raw))
 
 
 class FeatureObjective:
@@ -194,9 +189,8 @@ def _minimise(
     # within 0.005) in 4 to 11 times the processor time: 11.6 s against 3.0 s in a room of 260,000 points, 2.9 s against
     # 0.26 s on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
     def evaluate(raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        normalize = problem.settings.normalize
-        objective, gradient = problem.at(read_features(raw, normalize), closest)
-        return objective, raw_gradient(raw, gradient, normalize)
+        objective, gradient = problem.at(read_features(raw), closest)
+        return objective, raw_gradient(raw, gradient)
 
     pairs: list[Pair] = []
     value, gradient = evaluate(raw)
@@ -301,8 +295,8 @@ def _product(indptr, indices, data, dense, columns):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True)
-def _read(raw, normalize, columns):  # noqa: ANN001, ANN202
-    """As `read_features`: x -> 1/2 + x / (2 |x|), or x / max(|x|, 1)."""
+def _read(raw, columns):  # noqa: ANN001, ANN202
+    """As `read_features`: x -> 1/2 + x / (2 |x|)."""
     read = np.empty_like(raw)
     for g in prange(len(raw)):
         square = 0.0
@@ -310,15 +304,12 @@ def _read(raw, normalize, columns):  # noqa: ANN001, ANN202
             square += np.float64(raw[g, c]) ** 2
         length = np.sqrt(square)
         for c in range(len(columns)):
-            if normalize:
-                read[g, c] = 0.5 + 0.5 * raw[g, c] / length if length > 0 else 0.5
-            else:
-                read[g, c] = raw[g, c] / max(length, 1.0)
+            read[g, c] = 0.5 + 0.5 * raw[g, c] / length if length > 0 else 0.5
     return read
 
 
 @njit(cache=True, parallel=True)
-def _raw_gradient(raw, gradient, normalize, columns):  # noqa: ANN001, ANN202
+def _raw_gradient(raw, gradient, columns):  # noqa: ANN001, ANN202
     """As `raw_gradient`: the derivative of x / |x| keeps the part of the gradient perpendicular to x, over |x|."""
     pulled = np.empty_like(raw)
     for g in prange(len(raw)):
@@ -329,10 +320,7 @@ def _raw_gradient(raw, gradient, normalize, columns):  # noqa: ANN001, ANN202
         length = np.sqrt(square)
         for c in range(len(columns)):
             across = gradient[g, c] - raw[g, c] * along / square if square > 0 else 0.0
-            if normalize:
-                pulled[g, c] = 0.5 * across / length if length > 0 else 0.0
-            else:
-                pulled[g, c] = across / length if length > 1 else gradient[g, c]
+            pulled[g, c] = 0.5 * across / length if length > 0 else 0.0
     return pulled
 
 

@@ -147,12 +147,9 @@ class RenderedViews:
         ids = np.maximum(view.mask_map().ravel(), -1)
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
-        # Every wanted pixel has its own id; the last row, for all other pixels, is dropped.
-        wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
-        number = np.full(len(ids), -1, np.int32)
-        number[wanted] = np.arange(len(wanted))
-        image, ids = number.reshape(view.camera.height, view.camera.width), ids[wanted]
-        weights = view_weights(gaussians, view.camera, image, len(wanted), self.near).rows[:-1]
+        wanted = (ids >= 0) | self.whole
+        image = wanted.reshape(view.camera.height, view.camera.width)
+        weights, ids = view_weights(gaussians, view.camera, self.near, image), ids[wanted]
         coverage = weights.sum(axis=1)
         shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
         inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
@@ -163,7 +160,7 @@ class RenderedViews:
         mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
         small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
         mask, names = (torch.as_tensor(ids, device=self.device) for ids in (mask, names))
-        return RenderedView(small, mask, names, wanted[rows])
+        return RenderedView(small, mask, names, np.flatnonzero(wanted)[rows])
 
 
 def device_of(name: str) -> torch.device:
