@@ -347,7 +347,7 @@ def test_pixels_beyond_those_that_mode_paper_renders_are_left_out() -> None:
     settings = FitSettings(mode="paper", paper=PaperSettings(image_pixels=30 * 22))
     scene, journal = tiny_scene(3, 60, 44, focal=200.0), Journal(progress=False)
     prepared = prepare(scene, settings, journal)
-    np.testing.assert_array_equal(prepared.table.mask_pixels, [60 * 44] * 2)  # areas are of the whole image
+    np.testing.assert_array_equal(prepared.table.mask_pixels, [30 * 22] * 2)
     assert any(key is LeftOut.PIXELS_IN_PAPER_MODE for key, _ in journal.left_out)
     assert fit(scene, progress=False).instance_ids.tolist() == [0] * 3
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from commands import error_of
 from conftest import TinyCapture
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, random_array
 from test_fit import boxes_on_a_table
 from test_grouping import hand_table
@@ -329,6 +331,25 @@ def test_a_replaced_checkpoint_is_the_one_that_the_next_run_finds(tmp_path: Path
     with WorkFolder.open(tmp_path) as work:
         found = [array.tolist() for array in work.arrays("stage", "1", lambda: [np.zeros(3)])]
     assert found == ([[0, 0, 0]] if held else [[3, 3, 3], [1, 1]])
+
+
+def test_mask_maps_are_let_go_of_view_by_view(gaussians: Gaussians, expected: MaskTable) -> None:
+    """Those of hundreds of large photographs would be gigabytes."""
+    maps: list[weakref.ref[NDArray[np.int32]]] = []
+    held: list[int] = []
+
+    def watched(view: View) -> View:
+        def read() -> NDArray[np.int32]:
+            held.append(sum(known() is not None for known in maps))
+            ids = view.mask_map().copy()
+            maps.append(weakref.ref(ids))
+            return ids
+
+        return replace(view, masks=read)
+
+    assert_same(table_of(gaussians, map(watched, views()), side_by_side=1), expected)
+    assert len(held) == 7
+    assert max(held) <= 1
 
 
 def test_a_short_fit_writes_no_file(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -106,48 +107,43 @@ def mask_table(
     # What is not kept is not looked for by another run: it needs no fingerprint.
     of_all = fingerprint(*geometry, selected) if work.folder is not None else None
 
+    def arrays_of(view: View, ids: NDArray[np.int32] | None = None) -> tuple[NDArray[Any], ...]:
+        """Numbers of entries of each row (masks + 1,), the last for pixels without a mask; the entries' columns and
+        values; and columns and values of the exposure. ids: the view's mask map; None: it is read."""
+        ids = view.mask_map() if ids is None else ids
+        seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, selected)
+        rows, exposure = seen.rows, seen.openness
+        return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
+
     def shown(view: View) -> _ShownView:
         ids = view.mask_map()
         key = fingerprint(of_all, view_fingerprint(view, ids)) if of_all is not None else work.number()
-
-        def make() -> tuple[NDArray[Any], ...]:
-            """Numbers of entries of each row (masks + 1,), the last for pixels without a mask; the entries' columns and
-            values; and columns and values of the exposure."""
-            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, selected)
-            rows, exposure = seen.rows, seen.openness
-            return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
-
-        # Only a view's sizes are kept here: the work folder holds its entries, or writes them to a file.
-        lengths, *_, exposed = work.arrays("view", key, make)
+        # Only a view's sizes are kept here, no mask map: the work folder holds its entries, or writes them to a file.
+        lengths, *_, exposed = work.arrays("view", key, lambda: arrays_of(view, ids))
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
-        pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
-        return _ShownView(view.name, key, make, sizes, pixels, view.mask_features, view.mask_tracks)
+        return _ShownView(view, key, sizes, np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32))
 
     views_shown = list(_side_by_side(shown, views, side_by_side))
-    matrices = _put_together(views_shown, len(gaussians), work, most_in_memory)
+    views = [each.view for each in views_shown]
     return MaskTable(
-        *matrices,
-        np.repeat(np.arange(len(views_shown), dtype=np.int32), [len(view.pixels) for view in views_shown]),
-        np.concatenate([view.pixels for view in views_shown]),
-        stacked_features([view.mask_features for view in views_shown]),
-        stacked_tracks([(view.mask_tracks, len(view.pixels)) for view in views_shown]),
-        tuple(view.name for view in views_shown),
+        *_put_together(views_shown, len(gaussians), work, most_in_memory, arrays_of),
+        np.repeat(np.arange(len(views), dtype=np.int32), [view.mask_count for view in views]),
+        np.concatenate([each.pixels for each in views_shown]),
+        stacked_features([view.mask_features for view in views]),
+        stacked_tracks([(view.mask_tracks, view.mask_count) for view in views]),
+        tuple(view.name for view in views),
     )
 
 
 @dataclass(frozen=True)
 class _ShownView:
-    """A view whose arrays a work folder keeps under ``key``, or ``make`` makes anew. sizes: (3,)
-    numbers of entries in masks, outside of them, and of the exposure. pixels: (masks,) int32, area of each. name,
-    mask_features, mask_tracks: see `View`."""
+    """A view whose arrays a work folder keeps under ``key``. sizes: (3,) numbers of entries in masks, outside of them,
+    and of the exposure. pixels: (masks,) int32, area of each."""
 
-    name: str
+    view: View
     key: str
-    make: Callable[[], tuple[NDArray[Any], ...]]
     sizes: NDArray[np.int64]
     pixels: NDArray[np.int32]
-    mask_features: NDArray[np.float32]
-    mask_tracks: NDArray[np.integer] | None
 
 
 def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
@@ -158,21 +154,25 @@ def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
 
 
 def _put_together(
-    views: list[_ShownView], n: int, work: WorkFolder, most_in_memory: float
+    views: list[_ShownView],
+    n: int,
+    work: WorkFolder,
+    most_in_memory: float,
+    arrays_of: Callable[[View], tuple[NDArray[Any], ...]],
 ) -> tuple[csr_array, csr_array, csr_array]:
     """(weights, outside, exposure) of all views. Each view is freed once it is copied: none is in memory twice."""
-    sizes = sum((view.sizes for view in views), np.zeros(3, np.int64)).tolist()
+    sizes = sum((each.sizes for each in views), np.zeros(3, np.int64)).tolist()
     # 8 bytes an entry: an int32 column and a float32 value. Sizes are known, so no array grows and moves.
-    matrices = [SparseRows(entries, n, 8 * sum(sizes) > most_in_memory) for entries in sizes]
-    for view in views:
-        lengths, columns, values, exposed_columns, exposed_values = work.arrays("view", view.key, view.make)
-        work.forget("view", view.key)
+    weights, outside, exposure = (SparseRows(entries, n, 8 * sum(sizes) > most_in_memory) for entries in sizes)
+    for each in views:
+        anew = partial(arrays_of, each.view)  # should its file be damaged by now
+        lengths, columns, values, exposed_columns, exposed_values = work.arrays("view", each.key, anew)
+        work.forget("view", each.key)
         border = len(columns) - lengths[-1]  # the last row is of pixels outside of masks
-        matrices[0].append(lengths[:-1], columns[:border], values[:border])
-        matrices[1].append(lengths[-1:], columns[border:], values[border:])
-        matrices[2].append(len(exposed_columns), exposed_columns, exposed_values)
-    weights, unmasked, exposure = (rows.matrix() for rows in matrices)
-    return weights, unmasked, exposure
+        weights.append(lengths[:-1], columns[:border], values[:border])
+        outside.append(lengths[-1:], columns[border:], values[border:])
+        exposure.append(len(exposed_columns), exposed_columns, exposed_values)
+    return weights.matrix(), outside.matrix(), exposure.matrix()
 
 
 def stacked_features(of_views: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

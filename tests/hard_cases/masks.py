@@ -20,8 +20,7 @@ from og_pointcloud.settings import FitSettings
 
 @agrees(1e-6, "masks in the view", (0, *powers(0, 4)))
 def mask_count(count: float) -> Answer:
-    """None, the whole image as one mask, ... every one of 10,000 pixels as its own: votes on a point add up to what
-    the view sees of it."""
+    """None, one, ... a mask for each of 10,000 pixels: votes on a point add up to what the view sees of it."""
     masks, large, gaussians = int(count), camera(100, 100, 90.0), scatter(200)
     ids = np.full(10_000, -1, np.int32) if masks == 0 else (np.arange(10_000) * masks // 10_000).astype(np.int32)
     view = View("one", large, ids.reshape(100, 100), np.zeros((masks, 4), np.float32))
