@@ -10,6 +10,7 @@ from test_grouping import ONE, hand_table
 from og_pointcloud.fitting.holes import HALF_PLANE_MEAN_DIRECTION, WINDOW_POINTS, seen_through_holes
 from og_pointcloud.fitting.see_through import SEEN_THROUGH_SHARE, without_see_through
 from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.scene import Camera
 from og_pointcloud.settings import MembershipSettings
 
 Doubles = NDArray[np.float64]
@@ -109,12 +110,12 @@ def test_what_shows_through_a_hole_keeps_a_little_of_its_weight() -> None:
     mask; a quarter, about 0.4, does about each point."""
     xy, depth = over_a_floor(np.random.default_rng(2))
     xyz = np.column_stack([(xy - 0.5) * depth[:, None], depth]).astype(np.float32)
-    n = len(xyz)
+    n, camera = len(xyz), Camera(100, 100, 100.0, 100.0, 50.0, 50.0, np.eye(4))
     gaussians = Gaussians(xyz, np.ones_like(xyz), np.ones((n, 4), np.float32), np.ones(n, np.float32))
     table = hand_table(n, [[(range(n), ONE)]])
     table.mask_pixels[:] = 10_000
     before, exposed = table.weights.toarray()[0], table.exposure.toarray()[0]
-    after, share = without_see_through(table, gaussians, np.eye(4)[None], np.array([100.0]), MembershipSettings())
+    after, share = without_see_through(table, gaussians, [camera], MembershipSettings())
     kept = after.weights.toarray()[0] / before
     assert (kept[:400] == 1).all()
     through = kept[400:] < 1

@@ -31,6 +31,7 @@ from og_pointcloud.fitting.see_through import _front_run, without_see_through
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
 from og_pointcloud.rendering.geometry import neighborhood
 from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SETTINGS = MembershipSettings()
@@ -464,7 +465,7 @@ def at_depths(depth: Sequence[float]) -> Gaussians:
     return Gaussians(xyz, np.ones_like(xyz), np.ones((len(xyz), 4), np.float32), np.ones(len(xyz), np.float32))
 
 
-LOOKING_ALONG_Z = np.eye(4)[None]
+ALONG_Z = Camera(10, 10, 10.0, 10.0, 5.0, 5.0, np.eye(4))
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -489,8 +490,7 @@ def front_of(depth: Sequence[float], views: int = 1) -> tuple[MaskTable, MaskTab
     the table before, after, and the share taken."""
     n = len(depth)
     table = hand_table(n, [[(range(n), ONE)]] * views)
-    poses, focal = LOOKING_ALONG_Z.repeat(views, axis=0), np.full(views, 10.0)
-    return table, *without_see_through(table, at_depths(depth), poses, focal, SETTINGS)
+    return table, *without_see_through(table, at_depths(depth), [ALONG_Z] * views, SETTINGS)
 
 
 @pytest.mark.parametrize("views", [1, 20])
@@ -511,7 +511,7 @@ def test_a_view_keeps_as_much_of_its_word_as_is_not_behind_an_object() -> None:
     weights = np.array([first, [0, 0, 0, 0, 0, 0.25]], np.float32)
     outside = np.array([[0, 0, 0, 0, 0.25, 0]], np.float32)
     table = replace(table, weights=csr_array(weights), outside=csr_array(outside))
-    after, share = without_see_through(table, at_depths(depth), LOOKING_ALONG_Z, np.array([10.0]), SETTINGS)
+    after, share = without_see_through(table, at_depths(depth), [ALONG_Z], SETTINGS)
     assert share == pytest.approx(1.5 / 5.75)
     np.testing.assert_allclose(after.weights.toarray(), [[1, 1, 1, 1, 0, 0], weights[1]])
     np.testing.assert_allclose(after.exposure.toarray(), [[1, 1, 1, 1, 0.25, 0.25]])

@@ -50,7 +50,7 @@ def describe_instances(
     instance_ids: NDArray[np.int32],
     count: int,
 ) -> InstanceTable:
-    """One unit feature row per instance with its evidence.
+    """One unit feature row per instance with its evidence, and the instance that it is a part of.
 
     group: (masks,) int32, the instance of each mask, -1 none. instance_ids: (n,) int32, below 0 none.
     Masks without a feature (zero rows) count as evidence of the instance but not in its row; an instance whose masks
@@ -86,6 +86,7 @@ def describe_instances(
         masks=np.bincount(group[grouped], minlength=count).astype(np.int32),
         agreement=agreement,
         visible_area=np.bincount(group[grouped], shown[grouped], count).astype(np.float32),
+        part_of=part_of(table, group, instance_ids, count),
     )
 
 

@@ -247,9 +247,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
 def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:
     """The table without what its masks show behind their objects (`without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
-    poses = np.stack([camera.world_to_camera for camera in cameras])
-    focal = np.sqrt([camera.fx * camera.fy for camera in cameras])
-    table, share = without_see_through(table, surface.gaussians, poses, focal, settings.membership)
+    table, share = without_see_through(table, surface.gaussians, cameras, settings.membership)
     journal.notes["seen_through"] = round(share, 5)
     return table
 

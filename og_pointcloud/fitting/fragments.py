@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.grouping import MaskGroups, cosines_within_views, indicator, ordered
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.view_votes import PointVotes, ViewVotes
+from og_pointcloud.fitting.view_votes import FIXED_POINT_SCALE, PointVotes, ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 
@@ -43,10 +43,6 @@ ALIKE_SHARE_LESS = 0.5
 """The share is less by this, over the root of the number of masks of the smaller group: few differ more by chance."""
 MIN_SHARE = 0.01
 """No share w or a is nearer to 0 or 1 than this."""
-
-_FIXED_POINT_SCALE = float(1 << 24)
-"""Counts are rounded to multiples of its reciprocal, so that their float64 sums are exact and do not depend on the
-order of points."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +206,7 @@ def _borders(
     pairs = np.stack([np.repeat(at_border, usable.sum(axis=1)), around.index[at_border][usable]], axis=1)
     shown = _shown_together(pairs, point_votes[0], mask_view) * visibility[pairs].prod(axis=1, keepdims=True)
     # Rounded so that sums are exact and do not depend on the order of points.
-    shown = np.rint(shown * _FIXED_POINT_SCALE) / _FIXED_POINT_SCALE
+    shown = np.rint(shown * FIXED_POINT_SCALE) / FIXED_POINT_SCALE
     return _Borders.between(ids[pairs], shown, np.ones(len(pairs)))
 
 

@@ -219,7 +219,7 @@ def _decided_by_views(
         # A group that was shown as two things becomes two; a group that no point is left of goes.
         looks = looks_of_groups(table, groups.group, ids, groups.count)
         used, ids, mask_instance = renumbered(by_look(votes, ids, looks), looks.look)
-        instances = instances_of_groups(table, mask_instance, ids, len(used))
+        instances = describe_instances(table, mask_instance, ids, len(used))
         if coarse is not None:
             of_group = np.full(groups.count, len(coarse))
             np.minimum.at(of_group, groups.group[before >= 0], before[before >= 0])  # its largest leaf
@@ -241,17 +241,6 @@ def renumbered(
     number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 3, -1, np.int32)
     number[used] = np.arange(len(used), dtype=np.int32)
     return used, np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
-
-
-def instances_of_groups(
-    table: MaskTable,
-    mask_instance: NDArray[np.int32],
-    ids: NDArray[np.int32],
-    count: int,
-) -> InstanceTable:
-    """What the encoder saw of each of ``count`` instances, and which ones are parts of others."""
-    instances = describe_instances(table, mask_instance, ids, count)
-    return replace(instances, part_of=part_of(table, mask_instance, ids, count))
 
 
 def _leaves_as_instances(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import get_num_threads, njit
 from og_pointcloud.rendering.splatting import Gaussians, depth_and_slopes
+from og_pointcloud.scene import Camera
 from og_pointcloud.settings import MembershipSettings
 
 SEEN_THROUGH_SHARE = 0.1
@@ -24,8 +26,7 @@ still decided by the views that see them."""
 def without_see_through(
     table: MaskTable,
     gaussians: Gaussians,
-    world_to_camera: NDArray[np.float64],
-    focal: NDArray[np.float64],
+    cameras: Sequence[Camera],
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
     """Remove from each mask what does not lie at its object's depth, mostly behind it. The view is then blind to that:
@@ -39,19 +40,20 @@ def without_see_through(
     moves straight ahead, or stands still, looks past the same edges in all of them. A smaller run in front of the
     object is the edge of something that stands there.
 
-    world_to_camera: (views, 4, 4) float64. focal: (views,) pixels.
+    cameras: of the table's views.
     Returns the table without those weights and with its exposure reduced as much (what came through holes is kept as
     doubted), and their share of all weight. It replaces the given one, whose weights and exposure are overwritten.
     """
-    weights, views = table.weights, len(world_to_camera)
+    weights, views = table.weights, len(cameras)
     first_mask, kept = np.searchsorted(table.mask_view, np.arange(views + 1)), np.ones(weights.nnz, np.float32)
 
     def removed_in(view: int) -> float:
-        removed = 0.0
+        camera, removed = cameras[view], 0.0
+        focal = np.sqrt(camera.fx * camera.fy)
         for mask in range(first_mask[view], first_mask[view + 1]):
             entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
-            depth, xy = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
-            area = table.mask_pixels[mask] / focal[view] ** 2
+            depth, xy = _rays(gaussians.xyz, weights.indices[entries], camera.world_to_camera)
+            area = table.mask_pixels[mask] / focal**2
             kept[entries] = _weight_factors(depth, xy, weights.data[entries], area, settings)
             removed += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
         return removed

@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.association import describe_instances
 from og_pointcloud.fitting.colors import COLOR_DIFFERENCE_BINS
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
-from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
+from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import (
     MaskTable,
@@ -343,10 +344,7 @@ def _entries(
     splats = drawing.splats(cloud, rows, larger, settings.geometry.opacity)
     thickness = sight_thickness(cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
     table = mask_table(splats, [view], drawing.near, thickness)
-    camera = view.camera
-    front, _ = without_see_through(
-        table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
-    )
+    front, _ = without_see_through(table, splats, [view.camera], settings.membership)
     exposure = front.exposure
     distance, colors = differences(cloud.drawn_points.take(rows), view, drawing.near, exposure.indices, exposure.data)
     difference = csr_array((1 + distance.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape)
@@ -477,7 +475,7 @@ def _instances(
     certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in decided])
     used, ids, mask_instance = renumbered(look_of_point, looks.look)
     table = _table_of_sums(ids, used, shown, decided)
-    instances = instances_of_groups(table, mask_instance, ids, len(used))
+    instances = describe_instances(table, mask_instance, ids, len(used))
     return Labelling(ids, instances, mask_instance, certainty)
 
 

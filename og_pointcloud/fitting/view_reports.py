@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbor_weights
-from og_pointcloud.fitting.view_votes import PointVotes
+from og_pointcloud.fitting.view_votes import FIXED_POINT_SCALE, PointVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighborhood
 
@@ -58,10 +58,6 @@ MEAN_FIELD_ROUNDS = 5
 """Rounds in which points are updated by their neighbors."""
 EM_ROUNDS = 2
 """Rounds in which reports and color ratios are counted and states updated."""
-
-_FIXED_POINT_SCALE = float(1 << 24)
-"""Counts are rounded to multiples of its reciprocal, so that their float64 sums are exact and do not depend on the
-order of points."""
 
 
 @dataclass(frozen=True)
@@ -322,13 +318,13 @@ def _add_counts(masks, views, mask_reports, candidates, visibility, table, count
             for c in range(start[g], start[g + 1]):
                 if probability[c] == 0:
                     continue
-                weight = _FIXED_POINT_SCALE * probability[c] * used_vote * visibility[g] ** 2
+                weight = FIXED_POINT_SCALE * probability[c] * used_vote * visibility[g] ** 2
                 row = table_start[view] + state_row[view, state[c]] * (no_mask_column + 1)
                 for m in range(first_mask, e):
                     k = group[of_mask[m].row]
                     if k >= 0:
-                        counts[row + report_column[view, k]] += np.rint(weight * of_mask[m].vote) / _FIXED_POINT_SCALE
-                counts[row + no_mask_column] += np.rint(weight * no_mask) / _FIXED_POINT_SCALE
+                        counts[row + report_column[view, k]] += np.rint(weight * of_mask[m].vote) / FIXED_POINT_SCALE
+                counts[row + no_mask_column] += np.rint(weight * no_mask) / FIXED_POINT_SCALE
 
 
 @njit(cache=True)

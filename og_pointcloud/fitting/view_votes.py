@@ -30,6 +30,9 @@ OPENNESS_POWER = 2
 
 ENTRIES_AT_ONCE = 1 << 26
 """Votes that are sorted by point at once, half a gigabyte: more are sorted in passes, each writing to one region."""
+FIXED_POINT_SCALE = float(1 << 24)
+"""Counts of votes are rounded to multiples of its reciprocal, so that their float64 sums are exact and do not depend on
+the order of points."""
 VOTE = np.dtype([("row", np.int32), ("vote", np.float32)])
 """A vote on a point, and the mask or view that casts it: used together, they share a cache line."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[Any]]
