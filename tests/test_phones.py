@@ -133,6 +133,19 @@ def test_frames_without_a_partner_are_left_out(app):
         assert len(read_poses(folder).images) == 3
 
 
+def test_matrices_of_3d_scanner_app_may_be_listed_column_by_column(tmp_path):
+    write_scanner_app(tmp_path)
+    before = [image.camera for image in read_poses(tmp_path).images]
+    for file in tmp_path.glob("frame_0000[0-3].json"):
+        content = json.loads(file.read_text())
+        for key, side in (("cameraPoseARFrame", 4), ("intrinsics", 3)):
+            content[key] = np.reshape(content[key], (side, side)).T.ravel().tolist()
+        file.write_text(json.dumps(content))
+    for one, other in zip(read_poses(tmp_path).images, before, strict=True):
+        np.testing.assert_allclose(one.camera.world_to_camera, other.world_to_camera, atol=1e-12)
+        assert one.camera.intrinsics == other.intrinsics
+
+
 @pytest.mark.filterwarnings("ignore:.*no finite pose")
 @pytest.mark.parametrize(("stamp", "images"), [("10.099", 4), ("10.101", 4), ("10.102", 3)])
 def test_intrinsics_of_arkit_scenes_may_be_named_a_millisecond_off(tmp_path, stamp, images):

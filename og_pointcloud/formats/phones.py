@@ -3,8 +3,8 @@
 Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_cameras`` (``cameras``): a JSON per
                 image, ``fx fy cx cy width height`` and ``t_00`` ... ``t_23``, camera to world, ARKit's axes (y up, z
                 back); ``depth`` of 256 x 192, millimeters.
-3D Scanner App  ``frame_00000.jpg`` with ``frame_00000.json``: ``cameraPoseARFrame``, 16 numbers row by row, and
-                ``intrinsics``, 9 numbers; ``depth_00000.png``, millimeters. Most poses have no image.
+3D Scanner App  ``frame_00000.jpg`` with ``frame_00000.json``: ``cameraPoseARFrame``, 16 numbers, and ``intrinsics``,
+                9 numbers, row by row or column by column; ``depth_00000.png``, millimeters. Most poses have no image.
 ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_wide_intrinsics/*.pincam`` (width height
                 fx fy cx cy), whose names may be off by 1 ms, and ``lowres_wide.traj``: time, rotation vector,
                 translation, world to camera, OpenCV's axes. An image gets the pose nearest in time, if within 10 ms.
@@ -18,7 +18,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +39,7 @@ from og_pointcloud.formats.poses import (
     rigid,
     rotation_of_vector,
 )
+from og_pointcloud.scene import DoubleArray
 
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
@@ -82,11 +85,16 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
             yield RecordedFrame(file.name, source)
             continue
         content = read_json_object(source)
-        pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL_SIGNS
-        # 3 x 3, row by row.
-        fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
-        sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)  # it counts pixel centers at whole numbers
+        pose = _matrix(content, "cameraPoseARFrame", 4, source) * OPENGL_SIGNS
+        lens = Sensor.from_matrix(image_size(file), _matrix(content, "intrinsics", 3, source))
+        sensor = replace(lens, unit=MILLIMETER)
         yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth), Y_UP)
+
+
+def _matrix(content: dict[str, Any], key: str, side: int, source: Path) -> DoubleArray:
+    """A matrix listed row by row; or column by column, as ARKit holds it in memory: its last row is 0 ... 0 1."""
+    matrix = np.reshape(named_numbers(content.get(key), range(side * side), source), (side, side))
+    return matrix if not matrix[-1, :-1].any() else matrix.T
 
 
 def _is_arkit_scenes(folder: Path) -> bool:
