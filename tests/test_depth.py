@@ -8,7 +8,7 @@ import pytest
 from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, room_poses, write_depth, write_frames
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.depth import DepthFile, DepthImage, resampled
+from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
 from og_pointcloud.formats.fusion import (
     MAX_SLOPE,
     NOISE_TOLERANCE,
@@ -208,6 +208,26 @@ def test_large_map_offsets_cost_nothing(tmp_path):
     far = fuse(write_frames(tmp_path / "far", 4, offset))
     assert distance_to_surface(far.points.xyz_world - offset).max() < far.survey.voxel / 2
     assert abs(len(far.points) - len(near.points)) < 0.02 * len(near.points)
+
+
+def test_where_a_simulator_cuts_off_its_range_there_is_no_surface(tmp_path):
+    def cut(depth):
+        return np.minimum(depth, np.quantile(look(POSE)[0], 0.8))
+
+    def whole(fused):
+        return fused.survey.range_end == np.inf
+
+    fused = fuse(write_frames(tmp_path / "cut", spoiled=lambda _, depth: cut(depth)))
+    assert fused.survey.range_end == pytest.approx(np.quantile(look(POSE)[0], 0.8), abs=1e-3)
+    assert distance_to_surface(fused.points.xyz_world).max() < fused.survey.voxel / 2
+    assert whole(fuse(write_frames(tmp_path / "two", spoiled=lambda k, depth: cut(depth) if k < 2 else depth)))
+    # A floor that is seen from one height is as far in all views, and it is there.
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    floor = np.where(np.hypot(*np.mgrid[-60:60, -80:80]) < 20, 1.5, 2.0).astype(np.float32)
+    np.save(tmp_path / "floor.npy", floor)
+    poses = [np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1.0]]) @ down for x in (0, 0.1, 0.2, 0.3)]
+    frames = [DepthFrame(str(k), DepthFile(tmp_path / "floor.npy", camera(at))) for k, at in enumerate(poses)]
+    assert whole(fuse(frames))
 
 
 def test_one_view_is_enough(tmp_path):

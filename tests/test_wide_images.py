@@ -252,16 +252,18 @@ def test_colmaps_wide_cameras_are_views_too(tmp_path):
     assert all(image.lens is None for image in poses.images)
 
 
-def test_depth_of_a_wide_lens_is_read_in_front(tmp_path):
+@pytest.mark.parametrize("name", ["0", "pano_0"])  # the second is found by the image's name
+def test_depth_of_a_wide_lens_is_read_in_front(tmp_path, name):
     folder = write_panoramas(tmp_path, "OPENCV_FISHEYE", (256, 256))
-    edit_poses(folder, lambda content: content["frames"][0].update(depth_file_path="depth/0.npy"))
+    if name == "0":
+        edit_poses(folder, lambda content: content["frames"][0].update(depth_file_path="depth/0.npy"))
     (folder / "depth").mkdir()
-    np.save(folder / "depth/0.npy", np.full((256, 256), 2.0, np.float32))
+    np.save(folder / f"depth/{name}.npy", np.full((256, 256), 2.0, np.float32))
     poses = read_poses(folder)
-    depths = [image.depth for image in poses.images if image.depth is not None]
-    assert len(depths) == 1
-    assert depths[0].read().camera.width == poses.images[0].camera.width
-    assert (depths[0].read().depth == 2).all()
+    ((view, depth),) = capture.depth_files(folder, poses).items()
+    assert view == "pano_0/front"
+    assert depth.read().camera.width == poses.images[0].camera.width
+    assert (depth.read().depth == 2).all()
 
 
 def test_depth_of_a_panorama_is_refused(panoramas):

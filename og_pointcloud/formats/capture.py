@@ -394,9 +394,14 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
     for name, image in zip(poses.names, poses.images, strict=True):
         if image.depth is not None:
             files[name] = image.depth
-        elif path := find_depth(capture, name):
-            # Depth beside a distorted photograph has the same distortion; cube faces have depth images of their own.
-            whole = image.face if image.face is not None and not image.face.name else None
+            continue
+        # Depth beside a distorted photograph has the same distortion. Cube faces have depth images of their own; else
+        # the front face has that of the photograph, unless that is a sphere's.
+        face, path = image.face, find_depth(capture, name)
+        whole = face if face is not None and not face.name else None
+        if path is None and face is not None and face.name == "front" and not face.lens.wraps:
+            whole, path = face, find_depth(capture, posixpath.dirname(name))
+        if path is not None:
             camera, lens = (whole.whole, whole.lens) if whole else (image.camera, None)
             files[name] = DepthFile(path, camera, image.depth_unit, lens, image.integer_depth_unit)
     return files
@@ -419,7 +424,9 @@ def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
 
     fused = fuse(frames)
     empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None
-    for text in filter(None, (doubtful_depth(frames), empty)):
+    end = fused.survey.range_end
+    ends = f"many pixels say exactly {end:g}, the end of the camera's range: left out" if end < np.inf else None
+    for text in filter(None, (doubtful_depth(frames), empty, ends)):
         warnings.warn(f"{capture}: depth images: {text}", stacklevel=4)
     return fused
 

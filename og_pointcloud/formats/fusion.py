@@ -16,7 +16,7 @@ predicts what the other measures; in the wrong unit the prediction is wrong, unl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,9 @@ VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
 """Largest distance of a point from a measured depth of its surface, in voxels and in deviations of the noise."""
 JUDGING_ROUNDS = 2
 """Rounds in which all views vote on the points and move them."""
+MIN_ENDED_SHARE, MIN_ENDED_VIEWS = 0.02, 3
+"""A depth that is the largest of all, and exactly that of this share of the readings in this many views, is where a
+simulator cuts off its camera's range; an edge seen alike from all sides has one row of the pixels."""
 VOXELS_ACROSS = 1 << 21
 """Voxels along each axis, so that a voxel's three indices fit one 64-bit key."""
 
@@ -65,11 +68,13 @@ MIN_UNIT_GAIN = 0.3
 @dataclass(frozen=True)
 class Survey:
     """Measured on some frames, used for all. depth: median measured depth. footprint: median width of a pixel on the
-    surface. noise: standard deviation of one view's depths of a surface, 0 where no two views overlap."""
+    surface. noise: standard deviation of one view's depths of a surface, 0 where no two views overlap. range_end: the
+    depth that stands for "this or farther", infinite without one."""
 
     depth: float
     footprint: float
     noise: float
+    range_end: float = np.inf
 
     @property
     def voxel(self) -> float:
@@ -108,7 +113,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
         image = frame.depth.read()
         if not image.depth.any():
             empty.append(frame.name)
-        kept = on_surface(image, found.noise)
+        kept = _fusible(image, found)
         colors = frame.colors(image.camera)[kept] if frame.colors else np.zeros((int(kept.sum()), 3), np.uint8)
         voxels.add(to_world(image, kept) - origin, colors, f"view '{frame.name}'")
     refused = 0
@@ -132,9 +137,7 @@ def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
 
 def survey(frames: Sequence[DepthFrame]) -> Survey:
     """Depth, pixel width and noise, from evenly spread frames (from all, if those are empty)."""
-    images = [image for frame in evenly(frames, SURVEYED_VIEWS) if (image := frame.depth.read()).depth.any()]
-    if not images:
-        images = [image for frame in frames if (image := frame.depth.read()).depth.any()][:SURVEYED_VIEWS]
+    images, end = _within_range(_measured(evenly(frames, SURVEYED_VIEWS)) or _measured(frames)[:SURVEYED_VIEWS])
     if not images:
         raise SceneError(
             f"none of the {len(frames)} depth images has a measured pixel (e.g. {frames[0].depth.path}); expected "
@@ -148,7 +151,38 @@ def survey(frames: Sequence[DepthFrame]) -> Survey:
     # 1.4826: from the median of absolute values to a standard deviation. The difference of two views has the noise of
     # both, sqrt(2) times that of one; it is relative, so it is scaled by the typical depth.
     noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
-    return Survey(typical, float(np.median(np.concatenate(widths))), float(noise))
+    return Survey(typical, float(np.median(np.concatenate(widths))), float(noise), end)
+
+
+def _measured(frames: Sequence[DepthFrame]) -> list[DepthImage]:
+    return [image for frame in frames if (image := frame.depth.read()).depth.any()]
+
+
+def _range_end(images: Sequence[DepthImage]) -> float:
+    """The depth at which the camera's range was cut off, infinite if it was not."""
+    end = max((float(image.depth.max()) for image in images), default=np.inf)
+    shares = [np.count_nonzero(image.depth == end) / np.count_nonzero(image.depth) for image in images]
+    # A view that measured nothing else tells nothing: constant images are no depths, and are reported as such.
+    ended = [i for i, share in zip(images, shares, strict=True) if MIN_ENDED_SHARE <= share <= 1 - MIN_ENDED_SHARE]
+    if len(ended) < MIN_ENDED_VIEWS:
+        return np.inf
+    # Where all views put these readings into one plane, it may be a real one: a floor seen from one height.
+    axes = np.array([image.camera.world_to_camera[2, :3] for image in ended])
+    centers = np.array([image.camera.center for image in ended]) - ended[0].camera.center
+    along = (axes * centers).sum(axis=1)
+    is_plane = np.ptp(axes, axis=0).max() < AGREEING_SHARE and np.ptp(along) < AGREEING_SHARE * end
+    return np.inf if is_plane else end
+
+
+def _within_range(images: Sequence[DepthImage]) -> tuple[list[DepthImage], float]:
+    """The images, unmeasured where their camera's range ends, and that depth."""
+    end = _range_end(images)
+    return [replace(image, depth=np.where(image.depth < end, image.depth, np.float32(0))) for image in images], end
+
+
+def _fusible(image: DepthImage, found: Survey) -> NDArray[np.bool_]:
+    """(H, W) bool: readings on a surface, within the camera's range."""
+    return on_surface(image, found.noise) & (image.depth < found.range_end)
 
 
 def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
@@ -254,7 +288,7 @@ def _judge(
     for frame in frames:
         image = frame.depth.read()
         camera = image.camera
-        surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
+        surface = np.where(_fusible(image, found), image.depth, np.float32(0))
         # A view looks through a point only if all pixels around it do: a thin thing half a pixel off is still there.
         nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
         seen_from = camera.world_to_camera[:3, :3], camera.center - origin, camera.intrinsics
@@ -351,7 +385,7 @@ def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
     """A warning, with the cure, where views agree clearly better with all depths in another unit, or agree in no unit;
     else None."""
     # Poses keep their unit, so that depths only agree in the right one.
-    images = [image for frame in evenly(frames, CHECKED_VIEWS) if (image := frame.depth.read()).depth.any()]
+    images, _ = _within_range(_measured(evenly(frames, CHECKED_VIEWS)))
     shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNIT_FACTORS)}
     best = max(UNIT_FACTORS, key=shares.__getitem__)
     if shares[best] <= shares[1.0] + MIN_UNIT_GAIN:
