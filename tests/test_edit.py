@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from commands import error_of, output_of
+from commands import error_of, output_of, run
 from labelled_clouds import WORDS, make_cloud, room
 from scipy.spatial.transform import Rotation
 from scipy.special import lpmv
@@ -506,6 +506,21 @@ def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
         (["edit", "extract", bundle, "--id", "2"], "plain.spz stores only splats, the cloud has plain points"),
     ):
         assert says in error_of(capsys, *command, "-o", tmp_path / "plain.spz")
+
+
+def test_splats_that_are_not_finite_are_left_out_of_spz(scene, splats, tmp_path, capsys):
+    bundle = og.write_bundle(scene.cloud, tmp_path / "room.ogpc")
+    rows = read_ply(splats)["vertex"]
+    row = int(np.flatnonzero(scene.instance_ids == 2)[0])
+    rows["scale_1"][row] = np.nan
+    write_ply(splats, {"vertex": rows})
+    asked = "edit", "extract", bundle, "--id", "2", "--cloud", splats, "-o", tmp_path / "two.spz"
+    assert f"1 of {(scene.instance_ids == 2).sum()} Gaussians are not finite" in output_of(capsys, *asked)
+    assert len(og.read_points(tmp_path / "two.spz")) == (scene.instance_ids == 2).sum() - 1
+    code, _, told = run(capsys, "segment", bundle, "--points", splats, "-o", tmp_path / "all.spz")
+    assert (code, f"(the first is row {row}, in its scale): left out" in told) == (0, True)
+    labels = np.delete(og.segment(bundle).colors, row, axis=0)
+    assert np.abs(og.read_points(tmp_path / "all.spz").rgb.astype(int) - labels).max() <= 2
 
 
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
-from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.points import read_places, read_points
 from og_pointcloud.scene import Points
 
 SPLATS = Path(__file__).resolve().parents[2] / "shared" / "data" / "splats"
@@ -118,15 +119,22 @@ def test_extreme_but_finite_gaussians_stay_finite(tmp_path):
         ("f_dc_1", np.nan, "color"),
     ],
 )
-def test_gaussians_that_are_not_finite_are_one_clear_error(tmp_path, name, value, part):
+def test_gaussians_that_are_not_finite_are_left_out_and_keep_their_rows_among_places(tmp_path, name, value, part):
     raw = trained_columns()
+    whole = read_points(write_columns(tmp_path / "a.ply", raw))
     raw[name][[7, 20]] = value
-    path = write_columns(tmp_path / "a.ply", raw)
-    with pytest.raises(
-        SceneError, match=f"2 of 40 Gaussians are not finite .the first is row 7, in its {part}"
-    ) as caught:
-        read_points(path)
-    assert str(caught.value).count(str(path)) == 1
+    path, says = write_columns(tmp_path / "a.ply", raw), f"not finite .the first is row 7, in its {part}.: "
+    with pytest.warns(UserWarning, match=f"a.ply: 2 of 40 Gaussians are {says}left out") as caught:
+        points = read_points(path)
+    assert caught[0].filename == __file__
+    assert_same(points, whole.take(np.delete(np.arange(40), [7, 20])), atol=1e-6)
+    with pytest.warns(UserWarning, match=f"a.ply: 2 of 40 Gaussians are {says}unknown"):
+        places = read_places(path)
+    assert np.flatnonzero(np.isnan(places).all(axis=1)).tolist() == [7, 20]
+    np.testing.assert_array_equal(np.delete(places, [7, 20], axis=0), points.xyz_world)
+    raw[name][:] = value
+    with pytest.raises(SceneError, match=f"a.ply: 40 of 40 Gaussians .*row 0, in its {part}.; expected finite values"):
+        read_points(write_columns(path, raw))
 
 
 def test_a_missing_property_is_named(tmp_path):
@@ -256,8 +264,30 @@ def test_compressed_files_that_do_not_fit(tmp_path):
         read_points(tmp_path / "b.ply")
     elements["chunk"]["max_y"][1] = np.inf
     write_ply(tmp_path / "c.ply", elements)
-    with pytest.raises(SceneError, match=r"44 of 300 Gaussians are not finite .the first is row 256, in its position"):
-        read_points(tmp_path / "c.ply")
+    with pytest.warns(UserWarning, match=r"44 of 300 Gaussians are not finite .the first is row 256, in its position"):
+        assert len(read_points(tmp_path / "c.ply")) == 256
+
+
+# ---- .splat
+
+
+def test_splat_records_against_a_literal_packer(tmp_path):
+    points = read_points(write_columns(tmp_path / "a.ply", trained_columns()))
+    data = b""
+    for row in range(len(points)):
+        data += struct.pack("<6f", *points.xyz_world[row], *points.scale[row])
+        data += bytes([*points.rgb[row], round(float(points.opacity[row]) * 255)])
+        data += bytes(min(round(float(part) * 128 + 128), 255) for part in points.rotation[row])
+    (tmp_path / "a.splat").write_bytes(data)
+    found = read_points(tmp_path / "a.splat")
+    np.testing.assert_allclose(found.xyz_world, points.xyz_world, atol=1e-6)
+    np.testing.assert_array_equal(found.scale, points.scale)
+    np.testing.assert_array_equal(found.rgb, points.rgb)
+    np.testing.assert_allclose(found.opacity, points.opacity, atol=0.5 / 255 + 1e-6)
+    assert ((found.rotation * points.rotation).sum(axis=1) > 1 - 1e-4).all()
+    (tmp_path / "a.splat").write_bytes(data[:-1])
+    with pytest.raises(SceneError, match=r"a\.splat: it has 1279 bytes; expected 32 for each splat"):
+        read_points(tmp_path / "a.splat")
 
 
 # ---- files of other programs

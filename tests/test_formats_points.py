@@ -10,7 +10,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
-from og_pointcloud.formats.points import read_points, write_labelled_ply
+from og_pointcloud.formats.points import read_places, read_points, write_labelled_ply
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 XYZ = np.random.default_rng(6).normal(size=(30, 3))
@@ -91,10 +91,59 @@ def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, conte
     path = tmp_path / "a.ply"
     path.write_bytes(content)
     with pytest.raises(
-        SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* PCD .* LAZ, COPC, E57, SPZ or SOG"
+        SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* PCD .* E57, SPZ, SOG or .splat"
     ) as caught:
         read_points(path)
     assert str(caught.value).startswith(f"{path}: ")
+
+
+TEXTS = {
+    "plain": "1 2 3\n4 5 6\n", "one row, no line end": "1 2 3", "Windows": "\ufeff1\t2\t3\r\n4\t5\t6\r\n",
+    "named": '"id";"X";"Y";"Z";"Red";"Green";"Blue";"class"\n7;1;2;3;255;0;9;chair\n8;4;5;6;1;2;3;desk, x\n',
+    "named as a comment": "// 2 rooms\n//X Y Z Intensity R G B\n2\n\n1 2 3 99 255 0 9\n4 5 6 7 1 2 3\n",
+    "COLMAP's": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR\n7 1 2 3 255 0 9 0.1\n8 4 5 6 1 2 3 0.1\n",
+    "Leica's": "2\n1 2 3 -1200 255 0 9\n4 5 6 17 1 2 3\n", "with labels": "1,2,3,255,0,9,5\n4,5,6,1,2,3,6\n",
+    "with normals": "1 2 3 255 0 9 0 0 1\n4 5 6 1 2 3 0 -1 0\n", "shares": "1 2 3 1 0 0.035\n4 5 6 .0039 .0078 .0118\n",
+    "normals only": "1 2 3 0 0 1 # a\n4 5 6 0 -1 0\n", "a remark": "# x y z in meters\n1 2 3\n4 5 6\n",
+    "intensities": "1 2 3 0.5 7 8\n4 5 6 300 1 1\n",
+}  # fmt: skip
+WITHOUT_COLORS = ("plain", "one row, no line end", "Windows", "normals only", "a remark", "intensities")
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_clouds_in_text_as_programs_write_them(tmp_path, name):
+    (tmp_path / "a.csv").write_bytes(TEXTS[name].encode())
+    points = read_points(tmp_path / "a.csv")
+    assert points.xyz_world.tolist() == [[1, 2, 3], [4, 5, 6]][: len(points)]
+    expected = None if name in WITHOUT_COLORS else [[255, 0, 9], [1, 2, 3]]
+    assert (None if points.rgb is None else points.rgb.tolist()) == expected
+
+
+def test_rows_of_text_keep_their_places_and_digits(tmp_path):
+    (tmp_path / "a.xyz").write_text("431234.567 5412345.678 312\nnan nan nan\n1e400 0 0\n431235.567 5412345.678 312\n")
+    with pytest.warns(UserWarning, match=r"2 of 4 points contain NaN or infinity \(the first is row 1\): unknown"):
+        places = read_places(tmp_path / "a.xyz")
+    assert places[[0, 3]].tolist() == [[431234.567, 5412345.678, 312], [431235.567, 5412345.678, 312]]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 2 3\n4 5\n", "at row 2 with 2 columns.*expected 3 or more columns"),
+        ("1,2,3\n4,x,6\n", "string 'x' to float64 at row 1.*expected 3 or more columns"),
+        ("x,y,z\n1.5,2.5,\n", "not a geometry file"),
+        ("x;y;z\n1,5;2;3\n", "not a geometry file .*numbers x y z in each line .1.5, not 1,5."),
+        ("3\n1 2 3\n4 5 6\n", "its first line says 3 points, 2 follow"),
+        ("2\n3\n0 0 0\n1 0 0\n", "not a geometry file"),  # .ptx: a pose comes first
+        ("# of x, y, z, 2 points\n1 2 3\n4 5 6\n", "names 6 columns, the first row has 3; expected one name a column"),
+        ("x,y,z,red,green,blue\n1,2,3,300,0,0\n", "colors red, green, blue span 0..300"),
+    ],
+)
+def test_text_that_is_no_cloud_is_refused(tmp_path, text, says):
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(SceneError, match=says) as caught:
+        read_points(tmp_path / "a.txt")
+    assert str(caught.value).startswith(f"{tmp_path / 'a.txt'}: ")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")

@@ -6,6 +6,7 @@ import gzip
 import math
 import struct
 import tracemalloc
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -134,11 +135,22 @@ def test_extreme_splats_survive(tmp_path):
         points.xyz_world, rgb=None, scale=np.zeros_like(points.scale), rotation=points.rotation,
         opacity=np.ones_like(points.opacity),
     )  # fmt: skip
-    write_spz(tmp_path / "a.spz", flat)
+    with pytest.warns(UserWarning, match=r"a\.spz: 60 of 60 Gaussians have scales that SPZ cannot hold") as caught:
+        write_spz(tmp_path / "a.spz", flat)
+    assert caught[0].filename == __file__
     found = read_points(tmp_path / "a.spz")
     assert (found.opacity == 1).all()
     assert found.scale.max() < 1e-4
     assert np.abs(found.rgb.astype(int) - 128).max() <= 1
+
+
+@pytest.mark.parametrize(("scale", "held"), [((400, 1, 1), False), ((370, 0, 1e-9), True), ((4e-5, 0, 0), False)])
+def test_scales_that_the_format_cannot_hold_are_told(tmp_path, scale, held):
+    points = splats(9)
+    points.scale[4] = scale
+    with warnings.catch_warnings(record=True) as caught:
+        write_spz(tmp_path / "a.spz", points)
+    assert [str(warning.message).partition(" Gaussians")[0][-6:] for warning in caught] == ([] if held else ["1 of 9"])
 
 
 @pytest.mark.parametrize(("center", "size"), [((1e6, 2e6, 0), 3.0), ((0, 0, 0), 1e8), ((0, 0, 0), 1e-6)])

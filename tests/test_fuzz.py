@@ -117,6 +117,10 @@ def _spz(folder: Path) -> list[bytes]:
     return [(folder / "made.spz").read_bytes(), gzip.compress(raw, compresslevel=0)]  # of the second, damage is read
 
 
+def _splat(folder: Path) -> list[bytes]:
+    return [np.c_[_xyz(), np.exp(_xyz())].astype("<f4").view("u1").repeat(2, 1)[:, :32].tobytes()]
+
+
 def _sog(folder: Path) -> list[bytes]:
     return [written_sog(folder / "made.sog", *packed_sog(splats(12))).read_bytes()]
 
@@ -242,6 +246,9 @@ READERS: dict[str, tuple[Callable | bytes, Callable]] = {
     "cloud.pcd": (_pcd, lambda path: [read_points(path).xyz]),
     "splats.spz": (_spz, lambda path: [read_points(path).xyz]),
     "splats.sog": (_sog, lambda path: [read_points(path).xyz]),
+    "splats.splat": (_splat, lambda path: [read_points(path).xyz]),
+    "cloud.csv": (b"x,y,z,r,g,b,name\n1,2,3,4,5,6,a\n7.5,-8,9e1,4,5,6,b\n", lambda path: [read_points(path).xyz]),
+    "cloud.pts": (b"2\n1 2 3 -10 4 5 6\n4 5 6 90 255 0 9\n", lambda path: [read_points(path).xyz]),
     "cloud.las": (_las, lambda path: [read_points(path).xyz]),
     "cloud.copc.laz": (_copc, lambda path: [read_points(path).xyz]),
     "images.bin": (_images_bin, _read_images_bin),

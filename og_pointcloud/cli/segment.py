@@ -44,15 +44,15 @@ def run(arguments: argparse.Namespace) -> None:
         labels = common.names_in(arguments.labels)
         pose = None if arguments.pose is None else read_numbers(arguments.pose, 4)
         features = arguments.text_features
-        result = og.segment(arguments.points or scene, labels, scene, pose=pose, text_features=features)
+        # Splat formats are written as splats if the labelled points are splats; row by row, without those left out.
+        takes_splats = arguments.points and arguments.output and arguments.output.suffix in (".glb", ".spz")
+        points = og.read_points(arguments.points) if takes_splats else None
+        splats = points if points is not None and points.are_gaussians else None
+        result = og.segment(splats or arguments.points or scene, labels, scene, pose=pose, text_features=features)
     # Splats and the attributes of LAS points are kept as in the file, unless a pose moves them.
     unmoved, left_out = None if arguments.pose else arguments.points, None
     if arguments.output:
         with journal.stage("save"):
-            # Splat formats are written as splats if the labelled points are splats.
-            takes_splats = arguments.points and arguments.output.suffix in (".glb", ".spz")
-            points = og.read_points(arguments.points) if takes_splats else None
-            splats = points if points is not None and points.are_gaussians else None
             result.save(arguments.output, splats if unmoved else None, unmoved)
         if arguments.pose and splats:
             left_out = "splats, which --pose moves: points are written"

@@ -41,6 +41,11 @@ SPHERICAL_FROM_OPENGL = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 """OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
 
 
+def looks_like_e57(head: bytes) -> bool:
+    """Whether a file with these first bytes is an E57."""
+    return head.startswith(E57_SIGNATURE)
+
+
 def read_e57(path: StrPath) -> NDArray[np.void]:
     """Rows x, y, z and, if all scans have colors, red, green, blue of all scans of an E57 file in its world; points
     that the scanner marks as invalid are left out.

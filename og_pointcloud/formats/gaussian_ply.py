@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,15 @@ LOG_SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 Elements = Mapping[str, NDArray[np.void]]
+
+
+class Splats(NamedTuple):
+    """The Gaussians of a file. points: those whose values are all finite. finite: (n,) bool, the rows of the file that
+    became points. others: says how many rows did not; "" if none."""
+
+    points: Points
+    finite: NDArray[np.bool_]
+    others: str
 
 
 def latest_iteration(folder: Path) -> Path | None:
@@ -68,12 +78,12 @@ def holds_gaussians(elements: Elements) -> bool:
     return _are_compressed(elements) or not {"scale_0", "rot_0"}.isdisjoint(_names(elements))
 
 
-def gaussians_from_ply(elements: Elements) -> Points:
+def gaussians_from_ply(elements: Elements) -> Splats:
     """Gaussians from the elements of a trained or compressed 3DGS file; world coordinates, the median as origin.
 
     A zero quaternion is no rotation. Opacity logits of +-inf are 1 and 0, a log scale of -inf is 0: some converters
-    write them for splats that are fully opaque, invisible or flat. SceneError where a property is missing, any
-    other value is not finite, or a log scale is above 88.7, whose exponential overflows float32.
+    write them for splats that are fully opaque, invisible or flat. Any other value that is not finite, and a log scale
+    above 88.7, whose exponential overflows float32, leaves out its Gaussian. SceneError where a property is missing.
     """
     if "vertex" not in elements:
         raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}")
@@ -89,7 +99,7 @@ def _names(elements: Elements) -> tuple[str, ...]:
     return elements["vertex"].dtype.names or () if "vertex" in elements else ()
 
 
-def _trained(vertex: NDArray[np.void]) -> Points:
+def _trained(vertex: NDArray[np.void]) -> Splats:
     with np.errstate(over="ignore"):
         scale = np.exp(stack_columns(vertex, LOG_SCALE)).astype(np.float32)
     # The logistic function as tanh, which cannot overflow.
@@ -102,7 +112,7 @@ def _trained(vertex: NDArray[np.void]) -> Points:
     return activated(positions(vertex), scale, stack_columns(vertex, ROTATION), opacity, color)
 
 
-def _compressed(elements: Elements) -> Points:
+def _compressed(elements: Elements) -> Splats:
     vertex, chunk = elements["vertex"], elements["chunk"]
     expected = -(-len(vertex) // SPLATS_PER_CHUNK)
     if len(chunk) != expected:
@@ -166,26 +176,30 @@ def activated(
     rotation: DoubleArray,
     opacity: DoubleArray,
     color: DoubleArray | None,
-) -> Points:
-    """Points from activated values, quaternions wxyz (n, 4) of any length, and colors around [0, 1], which are clipped.
-    SceneError where a value is not finite."""
+) -> Splats:
+    """Splats from activated values, quaternions wxyz (n, 4) of any length, and colors around [0, 1], which are clipped.
+    SceneError where no row is finite."""
     parts = {"position": xyz, "scale": scale, "rotation": rotation, "opacity": opacity[:, None]}
     if color is not None:
         parts["color"] = color
+    placed, finite, others = xyz, np.ones(len(xyz), bool), ""
     if not all(np.isfinite(values).all() for values in parts.values()):
         # Checked by row only now: find the first such Gaussian, and which of its values.
-        finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
-        usable = np.logical_and.reduce(list(finite.values()))
-        first = int(np.argmin(usable))
-        blamed = next(name for name in finite if not finite[name][first])
-        raise SceneError(
-            f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
-            f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
-        )
+        by_part = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
+        finite = np.logical_and.reduce(list(by_part.values()))
+        first = int(np.argmin(finite))
+        blamed = next(name for name in by_part if not by_part[name][first])
+        others = f"{int((~finite).sum())} of {len(finite)} Gaussians are not finite (the first is row {first}, in its "
+        others += f"{blamed})"
+        if not finite.any():
+            raise SceneError(f"{others}; expected finite values, and log scales below 88.7: export it again")
+        placed, scale, rotation, opacity = xyz[finite], scale[finite], rotation[finite], opacity[finite]
+        color = None if color is None else color[finite]
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     # The rotation matrix formula gives the identity for a zero quaternion, so renderers show such splats unrotated.
     unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
     rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
-    return Points.from_world(
-        xyz, rgb=rgb, scale=scale, rotation=unit.astype(np.float32), opacity=opacity.astype(np.float32)
+    points = Points.from_world(
+        placed, rgb=rgb, scale=scale, rotation=unit.astype(np.float32), opacity=opacity.astype(np.float32)
     )
+    return Splats(points, finite, others)

@@ -57,6 +57,11 @@ LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA_BYTES = 14
 
 
+def looks_like_las(head: bytes) -> bool:
+    """Whether a file with these first bytes is a LAS or LAZ."""
+    return head.startswith(SIGNATURE)
+
+
 def read_las(path: StrPath) -> Points:
     """Positions, and colors where the point format has them.
 
@@ -118,7 +123,7 @@ def write_las(
 
 def _is_las(path: StrPath) -> bool:
     with naming(Path(path)), open(path, "rb") as file:
-        return file.read(len(SIGNATURE)) == SIGNATURE
+        return looks_like_las(file.read(len(SIGNATURE)))
 
 
 def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArray[np.uint8]) -> LasData:

@@ -65,6 +65,11 @@ class _Header:
     data_offset: int
 
 
+def looks_like_ply(head: bytes) -> bool:
+    """Whether a file with these first bytes is a PLY."""
+    return head.startswith((b"ply\n", b"ply\r", b"ply "))
+
+
 def read_ply(path: StrPath) -> dict[str, NDArray[np.void]]:
     """Element name -> (count,) structured array, one field per property, native byte order.
 

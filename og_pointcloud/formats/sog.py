@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three
 from og_pointcloud.formats.images import decoded_bytes, require_cv2, stated_size
 from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import DoubleArray, Points
+from og_pointcloud.scene import DoubleArray
 
 Bytes = NDArray[np.uint8]
 
@@ -47,7 +47,7 @@ def looks_like_sog(head: bytes) -> bool:
     return head.startswith(ZIP)
 
 
-def read_sog(path: StrPath) -> Points:
+def read_sog(path: StrPath) -> Splats:
     """Gaussians of a SOG file; world coordinates, the median as origin.
 
     SceneError, beginning with the path, for a file that is damaged, of another format, or claims more than it holds.

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import StrPath, write_file
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import DoubleArray, IntArray, Points
 
@@ -56,7 +57,7 @@ def looks_like_spz(head: bytes) -> bool:
     return head.startswith((MAGIC, GZIP))
 
 
-def read_spz(path: StrPath) -> Points:
+def read_spz(path: StrPath) -> Splats:
     """Gaussians of an SPZ file; world coordinates, the median as origin.
 
     SceneError, beginning with the path, for a file that is damaged, of another format, or claims more than it holds;
@@ -78,8 +79,9 @@ def read_spz(path: StrPath) -> Points:
 def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
     """Write Gaussians as SPZ version 3, whole or not at all. rgb: (n, 3), instead of the points' own colors.
 
-    Scales are written in steps of 6 % between 4.5e-5 and 379, colors in steps of two of 255; positions as finely as
-    24 bits allow. SceneError where these are not Gaussians, or lie so far from 0 that this is too coarse.
+    Scales are written in steps of 6 % between 4.5e-5 and 379, with a warning where a Gaussian's largest scale lies
+    outside; colors in steps of two of 255; positions as finely as 24 bits allow. SceneError where these are not
+    Gaussians, or lie so far from 0 that this is too coarse.
     """
     path = Path(path)
     with naming(path):
@@ -89,6 +91,14 @@ def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
         base = (np.full(points.xyz.shape, 127.5) if color is None else color) / 255 - 0.5
         with np.errstate(divide="ignore"):  # a scale of 0 becomes the smallest
             steps = (np.log(scale.astype(np.float64)) - MIN_LOG_SCALE) * LOG_SCALE_STEPS
+        # A step below 0 or above 255; that flat Gaussians become a little thicker is no loss.
+        largest = steps.max(axis=1)
+        if changed := int(((largest < -0.5) | (largest > 255.5)).sum()):
+            warnings.warn(
+                f"{path}: {changed} of {len(scale)} Gaussians have scales that SPZ cannot hold, below 4.5e-5 or above "
+                "379: written as the nearest; use another unit, or write a .ply",
+                stacklevel=2,
+            )
         columns = (
             positions,
             _byte(255 * opacity),

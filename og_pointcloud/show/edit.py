@@ -31,7 +31,7 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
+from og_pointcloud.formats.gaussian_ply import Splats, gaussian_rows, gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.spz import write_spz
@@ -163,7 +163,9 @@ class _Cloud:
             notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
             if not holds_gaussians(elements):
                 raise SceneError(f"{output} stores only splats, the cloud has plain points; expected .ply, or splats")
-            write_spz(output, gaussians_from_ply(elements))
+            splats = gaussians_from_ply(elements)
+            notes, rows = (*notes, *_left_out(output, splats)), rows[splats.finite]
+            write_spz(output, splats.points)
         else:
             write_ply(output, elements, [f"edited by og-pointcloud: {changed} points {verb}"])
         return Edit(Path(output), len(rows), changed, self.instances, notes)
@@ -289,11 +291,17 @@ def _read(path: Path) -> _Cloud:
         if len(elements.get("vertex", ())) == 0:
             raise SceneError("no points; expected an element 'vertex' of plain properties")
         if "packed_position" in (elements["vertex"].dtype.names or ()):  # SuperSplat's compressed splats
-            rows = gaussian_rows(gaussians_from_ply(elements))
-            return _Cloud({"vertex": rows}, (f"{path}: unpacked; harmonics above the constant one are left out",))
+            splats = gaussians_from_ply(elements)
+            notes = f"{path}: unpacked; harmonics above the constant one are left out", *_left_out(path, splats)
+            return _Cloud({"vertex": gaussian_rows(splats.points)}, notes)
         if not np.isfinite(positions(elements["vertex"])).all():
             raise SceneError("positions contain NaN or infinity; expected finite ones: remove those points first")
     return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
+
+
+def _left_out(path: StrPath, splats: Splats) -> tuple[str, ...]:
+    """The note on Gaussians that are not finite, if there are any."""
+    return (f"{path}: {splats.others}: left out",) if splats.others else ()
 
 
 def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray]:
