@@ -285,6 +285,9 @@ def test_splat_records_against_a_literal_packer(tmp_path):
     np.testing.assert_array_equal(found.rgb, points.rgb)
     np.testing.assert_allclose(found.opacity, points.opacity, atol=0.5 / 255 + 1e-6)
     assert ((found.rotation * points.rotation).sum(axis=1) > 1 - 1e-4).all()
+    (tmp_path / "a.splat").write_bytes(np.random.default_rng(0).bytes(3200))
+    with pytest.raises(SceneError, match=r"a\.splat: its quaternions have a median length of .*; expected 1"):
+        read_points(tmp_path / "a.splat")
     (tmp_path / "a.splat").write_bytes(data[:-1])
     with pytest.raises(SceneError, match=r"a\.splat: it has 1279 bytes; expected 32 for each splat"):
         read_points(tmp_path / "a.splat")

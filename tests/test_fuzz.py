@@ -118,7 +118,7 @@ def _spz(folder: Path) -> list[bytes]:
 
 
 def _splat(folder: Path) -> list[bytes]:
-    return [np.c_[_xyz(), np.exp(_xyz())].astype("<f4").view("u1").repeat(2, 1)[:, :32].tobytes()]
+    return [b"".join(struct.pack("<6f8B", *xyz, *np.exp(xyz), 9, 8, 7, 255, 200, 230, 128, 128) for xyz in _xyz(11))]
 
 
 def _sog(folder: Path) -> list[bytes]:
@@ -290,6 +290,7 @@ def first_files(name: str, folder: Path) -> list[bytes]:
 
 DOCUMENTED = {
     "PLY": ["cloud.ply"], "PCD": ["cloud.pcd"], "E57": ["scan.e57"], "SPZ": ["splats.spz"], "SOG": ["splats.sog"],
+    "`.splat`": ["splats.splat"], "text": ["cloud.pts"],
     "LAS, LAZ, COPC": ["cloud.las", "cloud.copc.laz"], "COLMAP's `.bin`": ["images.bin", "points3D.bin"],
     "nerfstudio's, Polycam's, 3D Scanner App's JSON": ["transforms.json", "polycam.json", "scanner_app.json"],
     "ARKitScenes' `.traj`, KITTI-360's poses": ["lowres_wide.traj", "cam0_to_world.txt"],
