@@ -24,6 +24,8 @@ from og_pointcloud.scene import DoubleArray, FloatArray, Points
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): color = 0.5 + SH_CONSTANT * f_dc."""
 SPLATS_PER_CHUNK = 256
+MAX_RATIO, ALWAYS_ALLOWED_BYTES = 20, 1 << 24
+"""A file may unpack to this many times its size, or to this many bytes."""
 
 BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
 LOG_SCALE = ("scale_0", "scale_1", "scale_2")
@@ -159,6 +161,11 @@ def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: DoubleArray
     of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
     with np.errstate(invalid="ignore"):  # infinite bounds give NaN, which is reported as such
         return minimum[of_splat] + (maximum - minimum)[of_splat] * share
+
+
+def unpacked_limit(packed: int) -> int:
+    """Bytes that a packed file of so many may unpack to: quantized noise, as splats are, compresses to half."""
+    return max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * packed)
 
 
 def from_smallest_three(largest: NDArray[np.integer], others: DoubleArray) -> DoubleArray:

@@ -25,10 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, printable
-from og_pointcloud.formats.atomic import StrPath
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three, unpacked_limit
 from og_pointcloud.formats.images import decoded_bytes, require_cv2, stated_size
-from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import DoubleArray
 
 Bytes = NDArray[np.uint8]
@@ -38,8 +36,6 @@ LARGEST_CODES = 252
 """The alpha of a rotation is this plus the index of its largest component, in the order w x y z."""
 TABLE_SIZE = 256
 MAX_META_BYTES = 1 << 20
-MAX_RATIO, ALWAYS_ALLOWED_BYTES = 20, 1 << 24
-"""An image may unpack to this many times the file's size, or to this many bytes: real ones have half of its bytes."""
 
 
 def looks_like_sog(head: bytes) -> bool:
@@ -47,32 +43,27 @@ def looks_like_sog(head: bytes) -> bool:
     return head.startswith(ZIP)
 
 
-def read_sog(path: StrPath) -> Splats:
+def read_sog(path: Path) -> Splats:
     """Gaussians of a SOG file; world coordinates, the median as origin.
 
-    SceneError, beginning with the path, for a file that is damaged, of another format, or claims more than it holds.
+    SceneError for a file that is damaged, of another format, or claims more than it holds.
     """
-    path = Path(path)
-    with naming(path):
-        with _whole_zip(), zipfile.ZipFile(path) as archive:
-            sog = _Sog(archive, path.stat().st_size)
-            low, high = sog.pixels("means", 0)[:, :3], sog.pixels("means", 1)[:, :3]
-            scales, rotation, color = sog.pixels("scales")[:, :3], sog.pixels("quats"), sog.pixels("sh0")
-        least, most = sog.numbers("means", "mins", 3), sog.numbers("means", "maxs", 3)
-        share = (low + high.astype(np.float64) * 256) / 65535
-        logarithm = least + (most - least) * share
-        if (rotation[:, 3] < LARGEST_CODES).any():
-            raise SceneError(
-                "the alphas of its rotations are not 252 to 255: export it again, without lossy compression"
-            )
-        others = (rotation[:, :3] / 255 - 0.5) * np.sqrt(2)
-        with np.errstate(over="ignore"):  # told as not finite
-            xyz = np.sign(logarithm) * np.expm1(np.abs(logarithm))
-            scale = np.exp(sog.numbers("scales", "codebook", TABLE_SIZE)[scales]).astype(np.float32)
-        base = 0.5 + SH_CONSTANT * sog.numbers("sh0", "codebook", TABLE_SIZE)[color[:, :3]]
-        return activated(
-            xyz, scale, from_smallest_three(rotation[:, 3] - LARGEST_CODES, others), color[:, 3] / 255, base
-        )
+    with _whole_zip(), zipfile.ZipFile(path) as archive:
+        sog = _Sog(archive, path.stat().st_size)
+        low, high = sog.pixels("means", 0)[:, :3], sog.pixels("means", 1)[:, :3]
+        scales, rotation, color = sog.pixels("scales")[:, :3], sog.pixels("quats"), sog.pixels("sh0")
+    least, most = sog.numbers("means", "mins", 3), sog.numbers("means", "maxs", 3)
+    share = (low + high.astype(np.float64) * 256) / 65535
+    logarithm = least + (most - least) * share
+    if (rotation[:, 3] < LARGEST_CODES).any():
+        raise SceneError("the alphas of its rotations are not 252 to 255: export it again, without lossy compression")
+    others = (rotation[:, :3] / 255 - 0.5) * np.sqrt(2)
+    with np.errstate(over="ignore"):  # told as not finite
+        xyz = np.sign(logarithm) * np.expm1(np.abs(logarithm))
+        scale = np.exp(sog.numbers("scales", "codebook", TABLE_SIZE)[scales]).astype(np.float32)
+    base = 0.5 + SH_CONSTANT * sog.numbers("sh0", "codebook", TABLE_SIZE)[color[:, :3]]
+    wxyz = from_smallest_three(rotation[:, 3] - LARGEST_CODES, others)
+    return activated(xyz, scale, wxyz, color[:, 3] / 255, base)
 
 
 @contextmanager
@@ -90,7 +81,7 @@ class _Sog:
     """A zip whose meta.json was checked. Its images are checked, and then unpacked, one by one."""
 
     def __init__(self, archive: zipfile.ZipFile, packed: int) -> None:
-        self._archive, self._most = archive, max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * packed)
+        self._archive, self._most = archive, unpacked_limit(packed)
         self._members = {info.filename: info for info in archive.infolist()}
         if META not in self._members:
             raise SceneError("a zip without meta.json; expected a SOG file of splats, as SuperSplat exports it")

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import StrPath, write_file
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, Splats, activated, from_smallest_three, unpacked_limit
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import DoubleArray, IntArray, Points
 
@@ -46,8 +46,6 @@ PART_SHIFTS = np.array([20, 10, 0], np.uint32)
 """Bits by which the three smaller components of a rotation, ten bits each, are shifted, in order."""
 AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 """Factors of x, y, z in positions and quaternions, between the two axis conventions."""
-MAX_RATIO, ALWAYS_ALLOWED_BYTES = 20, 1 << 24
-"""A file may unpack to this many times its size, or to this many bytes: quantized noise compresses to half."""
 MAX_STEP_SHARE = 1e-4
 """Largest rounding step of positions, as a share of the cloud's extent."""
 
@@ -57,23 +55,21 @@ def looks_like_spz(head: bytes) -> bool:
     return head.startswith((MAGIC, GZIP))
 
 
-def read_spz(path: StrPath) -> Splats:
+def read_spz(path: Path) -> Splats:
     """Gaussians of an SPZ file; world coordinates, the median as origin.
 
-    SceneError, beginning with the path, for a file that is damaged, of another format, or claims more than it holds;
-    MissingExtraError for version 4 without zstandard.
+    SceneError for a file that is damaged, of another format, or claims more than it holds; MissingExtraError for
+    version 4 without zstandard.
     """
-    path = Path(path)
-    with naming(path):
-        data = path.read_bytes()
-        count, bits, columns = _columns(data) if data.startswith(MAGIC) else _unpacked(data)
-        positions, opacity, color, log_scale, rotation = columns
-        xyz = _fixed_point(positions.reshape(count, 3, 3)) / 2.0**bits
-        base = 0.5 + SH_CONSTANT * (color.reshape(count, 3) / 255 - 0.5) / COLOR_SCALE
-        scale = np.exp(log_scale.reshape(count, 3) / LOG_SCALE_STEPS + MIN_LOG_SCALE).astype(np.float32)
-        xyzw = _three_bytes(rotation) if len(rotation) == 3 * count else _smallest_three(rotation.view("<u4"))
-        wxyz = np.column_stack([xyzw[:, 3], xyzw[:, :3] * AXIS_SIGNS])
-        return activated(xyz * AXIS_SIGNS, scale, wxyz, opacity / 255, base)
+    data = path.read_bytes()
+    count, bits, columns = _columns(data) if data.startswith(MAGIC) else _unpacked(data)
+    positions, opacity, color, log_scale, rotation = columns
+    xyz = _fixed_point(positions.reshape(count, 3, 3)) / 2.0**bits
+    base = 0.5 + SH_CONSTANT * (color.reshape(count, 3) / 255 - 0.5) / COLOR_SCALE
+    scale = np.exp(log_scale.reshape(count, 3) / LOG_SCALE_STEPS + MIN_LOG_SCALE).astype(np.float32)
+    xyzw = _three_bytes(rotation) if len(rotation) == 3 * count else _smallest_three(rotation.view("<u4"))
+    wxyz = np.column_stack([xyzw[:, 3], xyzw[:, :3] * AXIS_SIGNS])
+    return activated(xyz * AXIS_SIGNS, scale, wxyz, opacity / 255, base)
 
 
 def write_spz(path: StrPath, points: Points, rgb: Bytes | None = None) -> None:
@@ -130,7 +126,7 @@ def _header(head: bytes, packed: int) -> tuple[int, int, int, list[int]]:
         raise SceneError("it has 0 splats; expected at least one")
     # Positions, opacity, color, scale, rotation, harmonics.
     sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * HARMONICS[degree] * count]
-    if sum(sizes) > max(ALWAYS_ALLOWED_BYTES, MAX_RATIO * packed):
+    if sum(sizes) > unpacked_limit(packed):
         raise SceneError(
             f"it claims {count} splats, {sum(sizes)} bytes, in a file of {packed}: it is made to fill memory"
         )
