@@ -31,7 +31,7 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
 
     pcd: an array of shape (N, 3); a torch tensor of that shape, on any device; the Points of `read_points`; an
     Open3D point cloud or mesh, legacy or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a
-    PointCloud2 message; or the path of a geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices.
+    PointCloud2 message; or the path of a geometry file that `read_points` reads. A mesh's points are its vertices.
     SceneError for anything else; MissingExtraError where reading needs a library that is not installed.
     """
     if isinstance(pcd, (str, os.PathLike)):

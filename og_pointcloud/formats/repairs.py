@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.mask_files import MaskLayer
 from og_pointcloud.formats.poses import (
+    OPENGL_SIGNS,
     PosedImage,
     quaternion_of,
     read_json_object,
@@ -51,7 +52,6 @@ REPAIRS_NAME = "repairs.json"
 MAX_REPAIRS = 16
 SAME_LENS_TOLERANCE = 0.01
 """Depth images whose intrinsics, scaled, are the photographs' within this relative tolerance share their mistakes."""
-OPENGL_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MASK_FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "mirrored": lambda ids: ids[:, ::-1],
     "upside-down": lambda ids: ids[::-1],
@@ -256,7 +256,7 @@ def _none(cameras: list[Camera], repair: Repair) -> list[Camera]:
 
 
 KINDS = {
-    "axes": Kind(_each_pose(lambda pose, repair: OPENGL_FLIP @ pose), ("flipped",)),
+    "axes": Kind(_each_pose(lambda pose, repair: np.diag(OPENGL_SIGNS) @ pose), ("flipped",)),
     "direction": Kind(_each_pose(lambda pose, repair: np.asarray(np.linalg.inv(pose), np.float64)), ("inverse",)),
     "quaternions": Kind(_each_pose(_with_xyzw), ("xyzw",)),
     "world": Kind(_each_pose(_with_axes), AXIS_NAMES),
