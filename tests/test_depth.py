@@ -9,6 +9,7 @@ from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, r
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
+from og_pointcloud.formats.faces import CUBE
 from og_pointcloud.formats.fusion import (
     MAX_SLOPE,
     NOISE_TOLERANCE,
@@ -20,6 +21,7 @@ from og_pointcloud.formats.fusion import (
     to_world,
 )
 from og_pointcloud.formats.lenses import lens_of
+from og_pointcloud.formats.poses import rigid
 
 WIDTH, HEIGHT = ROOM_SIZE
 POSE = room_poses()[0]
@@ -214,20 +216,16 @@ def test_where_a_simulator_cuts_off_its_range_there_is_no_surface(tmp_path):
     def cut(depth):
         return np.minimum(depth, np.quantile(look(POSE)[0], 0.8))
 
-    def whole(fused):
-        return fused.survey.range_end == np.inf
-
     fused = fuse(write_frames(tmp_path / "cut", spoiled=lambda _, depth: cut(depth)))
     assert fused.survey.range_end == pytest.approx(np.quantile(look(POSE)[0], 0.8), abs=1e-3)
     assert distance_to_surface(fused.points.xyz_world).max() < fused.survey.voxel / 2
-    assert whole(fuse(write_frames(tmp_path / "two", spoiled=lambda k, depth: cut(depth) if k < 2 else depth)))
-    # A floor that is seen from one height is as far in all views, and it is there.
-    down = np.diag([1.0, -1.0, -1.0, 1.0])
-    floor = np.where(np.hypot(*np.mgrid[-60:60, -80:80]) < 20, 1.5, 2.0).astype(np.float32)
-    np.save(tmp_path / "floor.npy", floor)
-    poses = [np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1.0]]) @ down for x in (0, 0.1, 0.2, 0.3)]
-    frames = [DepthFrame(str(k), DepthFile(tmp_path / "floor.npy", camera(at))) for k, at in enumerate(poses)]
-    assert whole(fuse(frames))
+    # A floor that is seen from one height is as far in all views, and it is there; so are walls around a camera.
+    plane = np.where(np.hypot(*np.mgrid[-60:60, -80:80]) < 20, 1.5, 2.0).astype(np.float32)
+    np.save(tmp_path / "plane.npy", plane)
+    along_a_floor = [rigid(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 0.1, 0.2, 0.3)]
+    for poses in (along_a_floor, [rigid(turn, np.zeros(3)) for turn in CUBE.values()]):
+        frames = [DepthFrame(str(k), DepthFile(tmp_path / "plane.npy", camera(at))) for k, at in enumerate(poses)]
+        assert survey(frames).range_end == np.inf
 
 
 def test_one_view_is_enough(tmp_path):

@@ -166,12 +166,14 @@ def _range_end(images: Sequence[DepthImage]) -> float:
     ended = [i for i, share in zip(images, shares, strict=True) if MIN_ENDED_SHARE <= share <= 1 - MIN_ENDED_SHARE]
     if len(ended) < MIN_ENDED_VIEWS:
         return np.inf
-    # Where all views put these readings into one plane, it may be a real one: a floor seen from one height.
+    # There may be such surfaces: one plane for all views, as a floor seen from one height, or the walls of a square
+    # room around a camera that only turned.
     axes = np.array([image.camera.world_to_camera[2, :3] for image in ended])
     centers = np.array([image.camera.center for image in ended]) - ended[0].camera.center
     along = (axes * centers).sum(axis=1)
+    have_moved = np.ptp(centers, axis=0).max() >= AGREEING_SHARE * end
     is_plane = np.ptp(axes, axis=0).max() < AGREEING_SHARE and np.ptp(along) < AGREEING_SHARE * end
-    return np.inf if is_plane else end
+    return end if have_moved and not is_plane else np.inf
 
 
 def _within_range(images: Sequence[DepthImage]) -> tuple[list[DepthImage], float]:
