@@ -247,6 +247,17 @@ def test_recolored_splats_shine_in_the_new_color_from_everywhere(scene, splats, 
     np.testing.assert_allclose(now, (before @ luminance)[..., None] / mean * color, atol=1e-5)
 
 
+def test_a_splat_without_a_color_takes_that_of_no_other(scene, splats, tmp_path):
+    rows, (lost, *others) = vertices(splats), np.flatnonzero(scene.instance_ids == 3)
+    rows["f_dc_0"][lost] = np.nan  # as training leaves some
+    write_ply(tmp_path / "nan.ply", {"vertex": rows})
+    done = og.edit.recolor(scene, 3, tmp_path / "out.ply", (200, 100, 20), cloud=tmp_path / "nan.ply")
+    color, luminance = np.array([200, 100, 20]) / 255, np.array([0.2126, 0.7152, 0.0722])
+    before, now = (0.5 + SH_CONSTANT * stacked(of, BASE)[others] for of in (rows, vertices(done.path)))
+    mean = (np.clip(before, 0, 1) @ luminance).mean()
+    np.testing.assert_allclose(now, (before @ luminance)[:, None] / mean * color, atol=1e-5)
+
+
 def test_recolored_plain_cloud(scene, tmp_path):
     random, mine = np.random.default_rng(0), scene.instance_ids == 3
     grey = random.integers(60, 180, len(scene.xyz))
@@ -363,6 +374,17 @@ def test_inserted_splats_of_another_degree_keep_their_colors(tmp_path, base_degr
     assert len(done.notes) == (other_degree > base_degree)
 
 
+def test_inserted_flat_splats_of_two_scales_grow_with_the_pose(tmp_path):
+    columns = gaussian_columns(np.eye(3))
+    del columns["scale_2"]  # 2DGS has none
+    write_ply(tmp_path / "flat.ply", {"vertex": join_columns(columns)})
+    rows = vertices(
+        og.edit.insert(tmp_path / "flat.ply", tmp_path / "flat.ply", tmp_path / "o.ply", similarity(2.5)).path
+    )
+    for name in ("scale_0", "scale_1"):
+        np.testing.assert_allclose(np.exp(rows[name][3:]), 2.5 * np.exp(rows[name][:3]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("of_base", ["harmonics", "bytes"])
 def test_inserted_splats_keep_their_colors_as_the_base_has_its_own(tmp_path, of_base):
     """nerfstudio's exporter writes harmonics, or red green blue in their place."""
@@ -413,6 +435,16 @@ def test_properties_that_only_one_has_are_told(tmp_path):
         "curvature are 0 for the inserted points, which lack them",
         "label of the inserted points are left out: the cloud does not have them",
     )
+
+
+@pytest.mark.parametrize("kept", [np.uint8, np.uint32, np.float32])
+@pytest.mark.parametrize("added", [np.int32([300, -1]), np.float32([0.5, 7])])
+def test_inserted_values_that_the_clouds_type_cannot_hold_widen_it(tmp_path, kept, added):
+    base = plain_file(tmp_path / "base.ply", np.eye(3), label=np.array([1, 2, 255], kept))
+    other = plain_file(tmp_path / "other.ply", np.eye(2, 3), label=added)
+    done = og.edit.insert(base, other, tmp_path / "out.ply")
+    assert vertices(done.path)["label"].tolist() == [1, 2, 255, *added]
+    assert any("label have a wider type" in note for note in done.notes) == (kept != np.float32)
 
 
 @pytest.mark.parametrize("other", [

@@ -66,8 +66,8 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
     for normal in NORMAL_COLUMNS:
         if set(normal) <= set(columns):
             _set(columns, normal, stack_columns(rows, normal) @ rotation.T)
-    if set(LOG_SCALE) <= set(columns):  # 3DGS stores logarithms of standard deviations
-        _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE) + np.log(scale))
+    scales = [name for name in LOG_SCALE if name in columns]  # logarithms of standard deviations; 2DGS has two
+    _set(columns, scales, stack_columns(rows, scales) + np.log(scale))
     if set(ROTATION) <= set(columns):
         _set(columns, ROTATION, _rotated(quaternion_of(rotation), stack_columns(rows, ROTATION)))
     rest = _rest(rows)
@@ -79,7 +79,7 @@ def placed(rows: Rows, rotation: DoubleArray, scale: float, translation: DoubleA
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     """The rows of both, with the columns of the first; and notes of what was lost. If the two have colors in different
     columns or types, both become bytes. Positions become float64 if the first's type would move points
-    (`storable_positions`)."""
+    (`storable_positions`), and whole numbers get a wider type if the first's cannot hold the second's."""
     added = _colored_like(base, added)
     first, second = _columns(base), _with_harmonics(added, _rest_names(base))
     places = storable_positions(np.concatenate([positions(base), positions(added)])).dtype
@@ -88,14 +88,25 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
     if types[0] != types[1] and (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
         first, second = _in_bytes(first, ours), _in_bytes(second, theirs)
-    merged = {
-        name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
-    }
+    merged = {name: _joined(column, second.get(name, zeros)) for name, column in first.items()}
+    if widened := [name for name, column in first.items() if merged[name].dtype != column.dtype]:
+        notes.append(f"{_listed(widened)} have a wider type: the cloud's cannot hold the inserted values")
     if lacking := [name for name in first if name not in second]:
         notes.append(f"{_listed(lacking)} are 0 for the inserted points, which lack them")
     if dropped := [name for name in _columns(added) if name not in first]:
         notes.append(f"{_listed(dropped)} of the inserted points are left out: the cloud does not have them")
     return join_columns(merged), tuple(notes)
+
+
+def _joined(column: NDArray[Any], values: NDArray[Any]) -> NDArray[Any]:
+    """Both in the column's type; if that is of whole numbers and cannot hold the values, in a wider one that PLY has:
+    id 300 would be 44 in a byte."""
+    with np.errstate(invalid="ignore"):  # NaN is no whole number
+        fitted = values.astype(column.dtype)
+    if column.dtype.kind == "f" or np.array_equal(fitted, values):
+        return np.concatenate([column, fitted])
+    joined = np.concatenate([column, values])
+    return joined.astype(np.float64) if joined.dtype == np.int64 else joined
 
 
 def _colored_like(base: Rows, added: Rows) -> Rows:
@@ -123,7 +134,7 @@ def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
 def _color_map(base: DoubleArray, color: DoubleArray) -> tuple[DoubleArray, DoubleArray]:
     """(3, 3) matrix for colors (n, 3), which gives their luminance times the new color; and (3,) offset for colors that
     are too dark for that, so that their mean becomes the new color."""
-    mean = float((base @ LUMINANCE).mean())
+    mean = float(np.nanmean(base @ LUMINANCE))  # one splat that training left as NaN must not take the others along
     return np.outer(color, LUMINANCE) / max(mean, MIN_MEAN_LUMINANCE), color * max(0.0, 1 - mean / MIN_MEAN_LUMINANCE)
 
 
