@@ -117,6 +117,8 @@ def test_reading_refuses_what_open3d_reads_as_nothing(scene, tmp_path):
     assert len(og3.read(path).point["positions"]) == len(scene.xyz)
     for name in ("b.xyz", "c.unheard"):
         (tmp_path / name).write_text("no numbers here\n")
+    og.segment(scene, WORDS).save(tmp_path / "d.npz")  # Open3D raises a RuntimeError of several lines
+    for name in ("b.xyz", "c.unheard", "d.npz"):
         with pytest.raises(SceneError, match="Open3D reads no points from it"):
             og3.read(tmp_path / name)
     open3d.io.write_point_cloud(str(tmp_path / "D.PCD"), legacy_cloud(scene))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,14 +36,15 @@ def read(path: StrPath) -> Any:
     SceneError where Open3D would return an empty cloud and a warning (no file, no points, unreadable), and for a
     damaged PLY or PCD, for which it returns uninitialized memory.
     """
-    host, path = open3d(), Path(path)
+    host, path, cloud = open3d(), Path(path), None
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a point cloud")
     if path.suffix.lower() in (".ply", ".pcd"):
         world_points(path)  # raises for damaged ones
-    with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below covers it
+    # The error below covers Open3D's warnings, and the exception that it raises for a .npz of other arrays.
+    with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error), suppress(RuntimeError):
         cloud = host.t.io.read_point_cloud(str(path))
-    if cloud.is_empty():
+    if cloud is None or cloud.is_empty():
         raise SceneError(
             f"{path}: Open3D reads no points from it; expected a point cloud that it knows (.ply, .pcd, .xyz, .pts): "
             "the file is damaged, empty, or not of the kind that its name says"
