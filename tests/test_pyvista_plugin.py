@@ -312,6 +312,10 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
         plotter.og.add_segmentation(mesh, by="color")
     with pytest.raises(og.OgPointcloudError, match=r"0 points.*cannot be drawn"):
         plotter.og.add_segmentation(pv.PolyData())
+    for thing in (pv.MultiBlock([mesh]), og.segment(scene, ["plum"]), scene.xyz):
+        for draw in (plotter.og.add_segmentation, plotter.og.show_labelled):
+            with pytest.raises(og.OgPointcloudError, match="cannot be drawn; expected a segmented dataset"):
+                draw(thing)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         unknown = pv.PolyData(scene.xyz + 50).og.segment(["plum"], scene)

@@ -235,18 +235,16 @@ class OgPlotter:
 
     def _add_names(self, mesh: Any, labels: NDArray[np.integer], words: Sequence[str], name: str) -> None:
         """Draw each labelled instance's word, the largest instances first."""
-        ids = np.asarray(mesh.point_data[INSTANCE])
-        labelled = (labels >= 0) & (ids >= 0)
-        # Labelled points sorted by instance, cut where the next one begins.
-        order = np.argsort(ids[labelled], kind="stable")
-        points, sorted_ids = np.asarray(mesh.points)[labelled][order], ids[labelled][order]
-        present, first = np.unique(sorted_ids, return_index=True)
-        parts = np.split(points, first[1:]) if len(present) else []
-        largest = sorted(range(len(parts)), key=lambda part: -len(parts[part]))
-        if len(largest):
+        ids = np.where(labels >= 0, np.asarray(mesh.point_data[INSTANCE]), -1)
+        # The rows of each instance: those sorted by instance, cut where the next one begins.
+        order = np.argsort(ids, kind="stable")
+        parts = np.split(order, np.unique(ids[order], return_index=True)[1][1:])
+        parts = sorted((rows for rows in parts if ids[rows[0]] >= 0), key=len, reverse=True)
+        if parts:
+            points = np.asarray(mesh.points)
             self._plotter.add_point_labels(
-                np.array([_middle_point(parts[part]) for part in largest]),
-                [words[int(labels[labelled][order][first[part]])] for part in largest],
+                np.array([_middle_point(points[rows]) for rows in parts]),
+                [words[int(labels[rows[0]])] for rows in parts],
                 font_size=13, bold=False, font_family="arial", text_color="black", shape_color="white",
                 shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=f"{name}_names",
                 reset_camera=False, font_file=font_file("".join(words)),
@@ -300,7 +298,12 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
 
 def _drawable(mesh: Any) -> Any:
     """The dataset without non-finite points, which would make VTK draw nothing at all. OgPointcloudError if none are
-    left."""
+    left, and for anything but a dataset."""
+    if not isinstance(mesh, pv.DataSet):
+        raise OgPointcloudError(
+            f"a {type(mesh).__name__} cannot be drawn; expected a segmented dataset: result.to_pyvista(), or "
+            "mesh.og.segment(words) of each block of a MultiBlock, or of blocks.combine()"
+        )
     finite = np.logical_and.reduce(np.isfinite(np.asarray(mesh.points)), axis=1)
     if not finite.any():
         raise OgPointcloudError(
