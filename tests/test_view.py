@@ -17,7 +17,7 @@ from scenes import write_ply
 
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.show.page import Look, write_page
+from og_pointcloud.show.page import TEMPLATE, Look, write_page
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 Z_UP = np.array([0.0, 0, 1])
@@ -116,21 +116,26 @@ def test_why_an_instance_has_no_words_is_said(tmp_path):
     assert page.read_text(encoding="utf-8").count("row.note") == 1
 
 
-def test_the_up_button_starts_at_the_axis_nearest_to_up(bundle, tmp_path):
+def in_node(script):
+    """The lines that a script, given as lines, prints."""
     if (node := shutil.which("node")) is None:
         pytest.skip("no node here to run the page's script")
+    done = subprocess.run([node, "-e", "\n".join(script)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_the_up_button_starts_at_the_axis_nearest_to_up(bundle, tmp_path):
     scene = og.load(bundle)
     view = Viewpoint(np.ones(3), np.zeros(3), np.array([0.02, -0.1, 0.99]))
     write_page(tmp_path / "page.html", scene, og.segment(scene), view, Look("room"))
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if re.search(r'const (steepest|axis) = |\$\("up"\)\.onclick', line)]
     up = content(tmp_path / "page.html")["up"]
-    script = f"let up = {up}; const button = {{}}, $ = () => button, draw = () => {{}}\n" + "\n".join(
-        [*sorted(lines, key=lambda line: "onclick" in line), "axis(); console.log(button.textContent)"]
-        + ["button.onclick(); console.log(button.textContent, String(up))"] * 2
-    )
-    done = subprocess.run([node, "-e", script], capture_output=True, text=True, timeout=60)
-    assert done.stdout.splitlines() == ["up: z", "up: -z 0,0,-1", "up: x 1,0,0"], done.stderr
+    prelude = f"let up = {up}; const button = {{}}, $ = () => button, draw = () => {{}}"
+    script = [prelude, *sorted(lines, key=lambda line: "onclick" in line), "axis(); console.log(button.textContent)"]
+    script += ["button.onclick(); console.log(button.textContent, String(up))"] * 2
+    assert in_node(script) == ["up: z", "up: -z 0,0,-1", "up: x 1,0,0"]
 
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
@@ -169,6 +174,36 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
     empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
     assert "has no points to show" in error_of(capsys, "view", empty, "--html", tmp_path / "empty.html")
     assert not (tmp_path / "empty.html").exists()
+
+
+def called(prelude, function, call):
+    """What a function of the page prints in node, with its surroundings replaced by a prelude."""
+    text = TEMPLATE.read_text(encoding="utf-8")
+    constants = [line for line in text.splitlines() if line.startswith(("const VISIBLE", "const css"))]
+    own = re.search(rf"^function {function}\(.*?^\}}", text, re.DOTALL | re.MULTILINE)[0]
+    return in_node([prelude, *constants, own, call])
+
+
+def test_a_link_to_an_instance_that_the_page_lacks_shows_no_card():
+    prelude = """
+        const row = { points: 1, views: 1, words: [], label: -1, note: "" }, OFFSET = 3
+        const scene = { instances: [row], reasons: ["too far", "unobserved", "background"], unlabelled: "unknown" }
+        const add = (parent, tag, text) => (console.log(text), { style: {} })
+        const select = (ids, fill) => fill ? fill() : console.log("no card")"""
+    shown = called(prelude, "askInstance", "for (const id of [-4, 1, NaN, -1, 0]) askInstance(id)")
+    assert shown[:3] == ["no card"] * 3
+    assert shown[3:] == ["background", "no instance", "unknown", "instance 0 · 1 point · 1 view", ""]
+
+
+def test_a_name_as_long_as_a_sentence_does_not_cover_the_things():
+    prelude = """
+        const row = { points: 1, words: [], label: 0, center: [0, 0, 0] }, scene = { names: ["a".repeat(300)] }
+        const drawn = (text) => console.log(text)
+        const pen = new Proxy({}, { get: (_, name) => name === "fillText" ? drawn : () => ({ width: 9 }) })
+        const overlay = { getContext: () => pen }, innerWidth = 9, innerHeight = 9, devicePixelRatio = 1
+        const $ = (id) => ({ checked: id === "names" }), state = {}, colorOf = () => [0, 0, 0]
+        const shownInstances = () => [row], project = () => ({ x: 1, y: 1, depth: 1 })"""
+    assert called(prelude, "write", "write()") == ["a" * 40 + "…"]
 
 
 @pytest.mark.parametrize(
