@@ -6,13 +6,12 @@ import base64
 import html
 import struct
 import zlib
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import as_scene
-from og_pointcloud.ask.picking import front_points
+from og_pointcloud.ask.picking import DrawnPoints, front_points
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.collection.collection import Collection, Finding, Findings
 from og_pointcloud.errors import OgPointcloudError, coordinate
@@ -87,9 +86,7 @@ def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
     else:
         colors = cloud.rgb[rows].astype(float)
     colors[~in_instance] += FADE_SHARE * (BACKGROUND_GRAY - colors[~in_instance])
-    shown = replace(
-        cloud, xyz=local[rows], origin=np.zeros(3), instance_ids=cloud.instance_ids[rows], rgb=None, certainty=None
-    )
+    shown = DrawnPoints(local[rows], np.zeros(3), cloud.spacing, cloud.reach)
     eye = EYE_DISTANCE_WIDTHS * 2 * np.linalg.norm(reach) * EYE_DIRECTION / np.linalg.norm(EYE_DIRECTION)
     camera = Viewpoint(eye, np.zeros(3), UP_DIRECTION).camera(SIDE_PX, SIDE_PX, EYE_DISTANCE_WIDTHS * SIDE_PX)
     palette = np.append(colors, [[BACKGROUND_GRAY] * 3], axis=0).astype(np.uint8)
