@@ -36,7 +36,7 @@ from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.formats.tables import naming, positions
-from og_pointcloud.scene import DoubleArray, IntArray, numbers_of, pose_matrix
+from og_pointcloud.scene import DoubleArray, IntArray, numbers_of, pose_matrix, rotation_error
 from og_pointcloud.show.splat_columns import appended, placed, recolored
 from og_pointcloud.text.words import TextFeatures
 
@@ -310,7 +310,7 @@ def _similarity(pose: ArrayLike | None) -> tuple[DoubleArray, float, DoubleArray
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = np.cbrt(determinant)  # det(s R) = s^3
     rotation = matrix[:3, :3] / (scale if scale > 0 else 1)
-    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
+    if scale <= 0 or not rotation_error(rotation)[0] <= ROTATION_TOLERANCE:  # also if the error is NaN
         raise SceneError(
             f"pose has a determinant of {determinant:.4g} and shears or mirrors; expected a rotation times one "
             "positive scale: Gaussians cannot follow other poses"

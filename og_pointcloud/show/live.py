@@ -84,12 +84,13 @@ class LiveScene:
         self.names = words.names
         self.label_of = scene.chooser.choose(words.vectors).by_id[0]
         known = _known_changes(scene.cloud) if changes is None else changes
-        # Negative ids read the table's end: "as it was", the last of CHANGES.
-        unchanged = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)
-        self._change_of = None if known is None else np.concatenate([known, unchanged])
+        # By id, as label_of; negative ids read its end: "as it was", the last of CHANGES.
+        self._change_of = np.full(len(self.label_of), len(CHANGES) - 1)
+        if known is not None:
+            self._change_of[: len(known)] = known
         has = {
             "labels": self.names,
-            "changes": self._change_of is not None,
+            "changes": known is not None,
             "certainty": scene.certainty is not None,
             "photo": self.rgb is not None,
         }
@@ -122,7 +123,7 @@ class LiveScene:
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
         """(name, RGB, points), the most frequent first and unlabelled points last; colors are gray if the mode does not
         show labels."""
-        if self.mode == "changes" and self._change_of is not None:
+        if self.mode == "changes":
             points = np.bincount(self._change_of[self.ids], minlength=len(CHANGES)).tolist()
             return [(name, color, count) for (name, color), count in zip(CHANGES.items(), points, strict=True) if count]
         counts = np.bincount(self.label_of[self.ids] + 1, minlength=len(self.names) + 1).tolist()
@@ -142,17 +143,13 @@ class LiveScene:
         """Colors of labels, changes or instances, shaded by the brightness of the points' own colors."""
         count = len(self.scene.cloud.instances)
         table = np.full((len(self.label_of), 3), NO_LABEL, np.uint8)
-        own = label_colors(np.arange(count))
-        labelled = self.label_of[:count] >= 0
-        if self.mode == "labels":
-            # Lit instances should stand out even if none of the labels fits them.
-            show_own = ~labelled & self._is_lit[:count] if self.lit is not None else np.zeros(count, bool)
-            table[:count] = np.where(labelled[:, None], label_colors(self.label_of[:count]), table[:count])
-            table[:count][show_own] = own[show_own]
-        elif self.mode == "changes" and self._change_of is not None:
+        table[:count] = label_colors(np.arange(count))
+        if self.mode == "changes":
             table = np.array([*CHANGES.values()], np.uint8)[self._change_of]
-        else:
-            table[:count] = own
+        elif self.mode == "labels":
+            table[~self._is_lit] = NO_LABEL  # lit instances stand out in their own color even if no label fits them
+            labelled = self.label_of >= 0
+            table[labelled] = label_colors(self.label_of[labelled])
         return np.minimum(table[self.ids] * self._shade, 255).astype(np.uint8)
 
     @property

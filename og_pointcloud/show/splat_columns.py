@@ -193,9 +193,9 @@ def _rest(rows: Rows) -> DoubleArray:
 def _with_harmonics(rows: Rows, names: Sequence[str]) -> Columns:
     """The columns with these names for the harmonics: those that the rows lack are 0, higher ones are left out. Which
     one a column holds depends on the file's degree: f_rest_3 is green's first of degree 1, and red's fourth of 3."""
-    rest, count = _rest(rows), len(names) // 3
+    rest, count, own = _rest(rows), len(names) // 3, _rest_names(rows)
     fitted = np.pad(rest, ((0, 0), (0, 0), (0, max(0, count - rest.shape[2]))))[..., :count]
-    others = {name: column for name, column in _columns(rows).items() if name not in _rest_names(rows)}
+    others = {name: column for name, column in _columns(rows).items() if name not in own}
     return others | dict(zip(names, fitted.reshape(len(rows), len(names)).T, strict=True))
 
 
