@@ -210,6 +210,10 @@ def test_ids_of_one_scene_are_not_read_as_those_of_another(bundle, tmp_path):
         assert np.array_equal(mesh.og.boxes(other)["og_instance"], boxes["og_instance"]), "none is left out"
         assert np.array_equal(mesh.og.boxes(other)["og_color"], boxes["og_color"]), "the labels are another scene's"
         assert np.array_equal(mesh["og_instance"], ids)
+    for mixed in (np.full(len(ids), len(cloud.instances)), ids + 0.5):  # of an earlier fit; averaged by a filter
+        stale = pv.read(bundle)
+        stale.point_data["og_instance"] = mixed
+        assert np.array_equal(stale.og.boxes()["og_instance"], pv.read(bundle).og.boxes()["og_instance"])
     in_memory = og.LabelledScene.from_cloud(og.load(other).cloud)
     assert np.array_equal(pv.read(bundle).og.select("plum", in_memory).points, expected.points)
 
@@ -306,6 +310,11 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
     nameless["og_label"] = scene.instance_ids
     with pytest.raises(og.OgPointcloudError, match=r"PolyData of 3,000 points has no field array 'og_names'"):
         plotter.og.add_segmentation(nameless)
+    mixed = mesh.og.segment(["plum"], scene)
+    for labels, shown in ((mixed["og_label"] + 0.5, r"float64 up to 0\.5"), (mixed["og_label"] + 1, "int32 up to 1")):
+        mixed.point_data["og_label"] = labels
+        with pytest.raises(og.OgPointcloudError, match=rf"'og_label' is {shown}; expected whole numbers below 1"):
+            plotter.og.add_segmentation(mixed)
     with pytest.raises(og.OgPointcloudError, match="up is"):
         plotter.og.show_labelled(mesh.og.segment(["pear"], scene), up=(0, 0, 0))
     with pytest.raises(og.OgPointcloudError, match="expected 'label' or 'instance'"):

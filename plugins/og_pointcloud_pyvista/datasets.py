@@ -114,13 +114,16 @@ class OgDataSet:
         return box_lines([table[instance] for instance in ids], colors)
 
     def _with_instances(self, scene: LabelledScene, given: SceneLike | None) -> Any:
-        """This dataset if its instance ids are this scene's, else a shallow copy with the scene's.
+        """This dataset if its instance ids are this scene's, else a shallow copy with the scene's: also where the scene
+        lacks some of them, or a filter has mixed them to fractions.
 
         given: the scene that the caller passed; None where the dataset names it.
         """
+        ids = np.asarray(self._mesh.point_data.get(INSTANCE, ()))
+        in_table = ids.dtype.kind in "iu" and ids.max(initial=-1) < len(scene.cloud.instances)
         named = np.asarray(self._mesh.field_data.get(SCENE_FIELD, ())).ravel()
         is_own = given is None or not len(named) or (scene.path is not None and named[0] == scene_name(scene.path))
-        if INSTANCE in self._mesh.point_data and is_own:
+        if in_table and is_own:
             return self._mesh
         check_in_world(self._mesh)
         mesh = self._mesh.copy(deep=False)
@@ -139,14 +142,20 @@ def check_in_world(mesh: pv.DataSet) -> None:
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
-    """Names of the labels in og_label; OgPointcloudError if the dataset lacks either."""
+    """Names of the labels in og_label; OgPointcloudError if the dataset lacks either, or a label has no name."""
     for kind, data, name in (("point", mesh.point_data, LABEL), ("field", mesh.field_data, NAMES_FIELD)):
         if name not in data:
             raise OgPointcloudError(
                 f"the {type(mesh).__name__} of {mesh.n_points:,} points has no {kind} array '{name}'; expected a "
                 "segmented dataset: mesh = mesh.og.segment(['chair', 'table'])"
             )
-    return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES_FIELD]).ravel())
+    names, labels = np.asarray(mesh.field_data[NAMES_FIELD]).ravel(), np.asarray(mesh.point_data[LABEL])
+    if labels.dtype.kind not in "iu" or labels.max(initial=-1) >= len(names):
+        raise OgPointcloudError(
+            f"point array '{LABEL}' is {labels.dtype} up to {labels.max(initial=-1):g}; expected whole numbers below "
+            f"{len(names)}, which index '{NAMES_FIELD}': filters that interpolate mix labels, so segment their result"
+        )
+    return tuple(map(str, names))
 
 
 def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
