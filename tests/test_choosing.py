@@ -260,6 +260,8 @@ def test_without_a_bank_the_largest_cosine_is_called_and_no_probability_claimed(
     np.testing.assert_array_equal(choice.labels, cosines.argmax(axis=1))
     assert np.isnan(choice.probability).all()
     assert np.isnan(choice.unknown).all()
+    opposite = np.stack([np.zeros(WIDTH), -made.table.descriptors[0]])
+    assert Chooser(made.table).choose(opposite).labels[0] == 1, "a zero row fits nothing"
 
 
 def test_templates_narrow_what_prompts_scatter():

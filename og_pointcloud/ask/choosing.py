@@ -225,14 +225,16 @@ class Chooser:
         self._require_width(texts, "label vectors")
         if len(self._descriptors) == 0 or len(texts) == 0:
             return self._nothing(len(texts))
+        is_zero = ~texts.any(axis=1)
         if self.bank is None:
             cosines = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
+            cosines[:, is_zero] = -np.inf  # 0 would be the largest where all others are negative
             nothing = np.full(cosines.shape, np.nan)
             return self._answer(cosines, nothing, nothing[:, 0])
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
         scores = (self._centered @ directions.T - self._middle) / self._spread
         evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # like the bank's words
-        evidence[:, ~texts.any(axis=1)] = -np.inf  # a zero row, minus the bank's mean, would point somewhere
+        evidence[:, is_zero] = -np.inf  # a zero row, minus the bank's mean, would point somewhere
         return self._answer(evidence, *self._posterior(evidence, texts, directions))
 
     def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
