@@ -154,6 +154,8 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     fewer = {name: values[1:] for name, values in attributes.items()}
     with pytest.raises(SceneError, match=r"survey\.laz: it has 12 points, 11 were labelled"):
         write_las(path, points.xyz_world[1:], gray[1:], fewer, ("bush",), tmp_path / "survey.laz")
+    with pytest.raises(SceneError, match=r"survey\.laz: its points lie up to .* from those that were labelled"):
+        write_las(path, points.xyz_world[::-1], gray, attributes, ("bush",), tmp_path / "survey.laz")
     with pytest.raises(SceneError, match=r"none\.laz: No such file"):  # not only the file to write
         write_las(path, points.xyz_world, gray, attributes, ("tree",), path.with_name("none.laz"))
 

@@ -155,8 +155,8 @@ class Segmentation:
         .spz: splats in the labels' colors; the format cannot hold labels.
         splats: the Gaussians, row by row, if the query points were Gaussians: `read_points` of their file. Only .glb
             and .spz keep them.
-        source: the file that was labelled. From .las or .laz to .las or .laz, its point attributes and coordinate
-            system are kept, and only labels are added.
+        source: the file that was labelled, without a pose. From .las or .laz to .las or .laz, its point attributes and
+            coordinate system are kept, and only labels are added.
         OgPointcloudError for another suffix; SceneError if the format cannot hold the points: .las and .glb cannot hold
         NaN, .glb no empty cloud.
         """

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from laspy import LasData
 
 SIGNATURE = b"LASF"
+SAME_PLACE_SHARE = 1e-3
+"""Share of the extent by which labelled points may differ from the file's: float32 may have rounded map coordinates."""
 POINTS_PER_CHUNK, CHUNK_BYTES = 1_000_000, 1 << 26
 """Read at once, at most, so that memory use depends on the points in the file, not on the count in its header."""
 UNLABELLED = 1
@@ -104,12 +106,12 @@ def write_las(
     source: the file that the points come from, in its order. If it is LAS, positions, colors, intensity, returns,
         times, other extra bytes and the coordinate system are kept, and so are user data and the classes of points
         without a label (1 for those that an earlier run labelled).
-    SceneError where a coordinate is not finite, the names are too long or the source differs in its number of points;
+    SceneError where a coordinate is not finite, the names are too long or the source has other points;
     MissingExtraError without laspy.
     """
     path = Path(path)
     with naming(path):
-        survey = None if source is None or not _is_las(source) else _points_of(Path(source), len(xyz_world))
+        survey = None if source is None or not _is_las(source) else _points_of(Path(source), xyz_world)
         las = _new(xyz_world, rgb, attributes["og_reason"]) if survey is None else survey
         _add_labels(las, attributes, names, keep_classes=survey is not None)
         with replacing(path) as file:
@@ -139,13 +141,21 @@ def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArra
     return las
 
 
-def _points_of(source: Path, count: int) -> LasData:
-    """A file's points in a point format with 8-bit classes, without the labels of an earlier run."""
+def _points_of(source: Path, xyz_world: NDArray[np.floating]) -> LasData:
+    """A file's points in a point format with 8-bit classes, without the labels of an earlier run. xyz_world: (n, 3),
+    where they must be."""
     with _opened(source) as reader:
-        stated = reader.header.point_count
+        stated, count = reader.header.point_count, len(xyz_world)
         las = reader.read() if stated == count else None  # it allocates memory for as many as are stated
         if las is None or len(las.points) != count:
             raise SceneError(f"it has {stated} points, {count} were labelled; expected the labelled file")
+        apart = max(float(np.abs(las[axis] - at).max(initial=0)) for axis, at in zip("xyz", xyz_world.T, strict=True))
+        extent = float(np.ptp(xyz_world, axis=0).max()) if count else 0.0
+        if not apart <= SAME_PLACE_SHARE * extent + max(las.header.scales):
+            raise SceneError(
+                f"its points lie up to {apart:.4g} from those that were labelled; expected the labelled file, in its "
+                "order and without a pose"
+            )
     degrees = getattr(las, "scan_angle_rank", None)
     las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
     if degrees is not None:  # laspy drops it: its name and unit differ in the new format
