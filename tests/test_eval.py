@@ -72,6 +72,8 @@ def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
     said = error_of(capsys, "eval", "capture", tmp_path / "bare", tmp_path / "wordless.ogpc")
     assert "wordless.ogpc has no words; expected the capture's text_features.npz" in said
     assert "--labels" not in said, "this command has no such option"
+    kept = ("eval", "capture", fitted / "tiny", fitted / "S.ogpc", "--json", fitted / "tiny/transforms.json")
+    assert "which is an input; expected another name" in error_of(capsys, *kept)
 
 
 def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path, capsys):

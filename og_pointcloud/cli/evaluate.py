@@ -33,7 +33,7 @@ TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 def add(parser: Parser) -> None:
     add_path = partial(common.add_option, type=common.replaceable)
     capture, scannet, lerf = common.add_commands(parser, "protocol", run_capture, run_scannet, run_lerf)
-    add_path(capture, "capture", "CAPTURE", "folder with gt.npz")
+    common.add_option(capture, "capture", "CAPTURE", "folder with gt.npz", type=Path)
     add_path(capture, "bundle", "S.ogpc", "file that `fit` wrote for it")
     add_path(capture, "--against", "OTHER.ogpc", "another file: also score the paired difference, minus OTHER")
     add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")

@@ -35,6 +35,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.undo:
         if arguments.repairs:
             raise OgPointcloudError("--undo takes no repairs: leave out one or the other")
+        if not capture.is_dir():
+            raise OgPointcloudError(f"{capture} is not a folder; expected the capture folder")
         file.unlink(missing_ok=True)
         print(f"{capture} has no repairs: its files are read as they are")
         return
