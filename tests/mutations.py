@@ -429,7 +429,7 @@ MUTATIONS = (
     ),
     Mutation(
         "an encoder of another space answers", "text/encoder.py",
-        "if not FeatureSpace(feature_space).accepts(FeatureSpace(encoder.feature_space)):", "if not encoder:",
+        "if not FeatureSpace(feature_space).accepts(encoder.space):", "if not encoder:",
         trust("a_carried_encoder_of_another_space_answers_nothing"),
     ),
     Mutation(

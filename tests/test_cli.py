@@ -244,6 +244,9 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("serve", "a.ogpc", "--up", "w"), "--up is 'w'; expected x, y, z, "),
         (("import", "house.e57", "-o", "house.ogpc"), "-o is house.ogpc; expected a folder name"),
         (("report", "capture", "--quick", "--knob", "mode"), "not allowed with"),
+        (("index", ".", "-o", "."), "-o is '.', which is a folder"),
+        (("index", ".", "-o", "atlas.ogpc"), "-o is 'atlas.ogpc'; expected another ending"),
+        (("repair", "absent", "--undo"), "absent is not a folder"),
         (("find", "room.ogpc", "chair"), "expected what `og-pointcloud index FOLDER -o ATLAS` wrote: one scene"),
     ],
 )  # fmt: skip

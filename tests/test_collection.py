@@ -16,11 +16,13 @@ import numpy as np
 import pytest
 from commands import error_of, output_of, run
 from labelled_clouds import instance_table, unit_rows
+from text_models import encoder_files, write_files
 
 import og_pointcloud as og
 from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.collection.index import index
 from og_pointcloud.collection.lance import write_lance
+from og_pointcloud.collection.scoring import largest
 from og_pointcloud.collection.store import SUPER_JOURNAL_MARK, Atlas
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.show.findings_page import picture, png_bytes
@@ -97,6 +99,10 @@ def test_the_best_are_found_without_scoring_all(judged, top, monkeypatch):
         assert [f.score for f in some] == pytest.approx([f.score for f in everything[:top]], rel=1e-4)
 
 
+def test_of_equals_the_first_ones_are_found():
+    assert largest(np.zeros(1000), lambda rows: np.zeros(len(rows)), 3)[0].tolist() == [0, 1, 2]
+
+
 def test_the_room_with_the_thing_comes_first(folder):
     things = {name: [name, *(other for other in THINGS[:3] if other != name)] for name in THINGS[3:]}
     clouds = {f"{name} room": scene(kinds, k, noise=0.1) for k, (name, kinds) in enumerate(things.items())}
@@ -160,8 +166,33 @@ def test_vectors_are_asked_of_the_scenes_of_their_encoder(folder):
     assert {f.scene for f in collection.find("seat", text_features=features)} == {"b"}
     other_width = (Vocabulary(("chair",), np.ones((1, 5), np.float32)), SPACE)
     assert [f.scene for f in collection.find("chair", scenes="a", text_features=other_width)] == ["a"]
-    with pytest.raises(OgPointcloudError, match="'seat' is not among the 8 words"):
+    with pytest.raises(FeatureSpaceError, match=r"names of text_features are in .*'another/encoder' \(dimension 5\)"):
         collection.find("seat", text_features=(Vocabulary(("seat",), np.ones((1, 5), np.float32)), "another/encoder"))
+
+
+def test_a_file_that_is_damaged_or_of_another_encoder_by_now_encodes_no_word(folder, tmp_path):
+    spaces = {SPACE: tmp_path / "ours", "another/encoder": tmp_path / "theirs"}
+    for seed, (space, path) in enumerate(spaces.items()):
+        write_files(path, encoder_files(space, WIDTH, seed=seed))
+    for name in "ab":
+        og.write_bundle(scene(["desk"]), folder / f"{name}.ogpc", text_encoder=spaces[SPACE])
+    collection = indexed(folder, {})
+    before = collection.find("cat").to_json()
+    theirs = scene(["desk"], space="another/encoder")
+    og.write_bundle(theirs, folder / "a.ogpc", text_encoder=spaces["another/encoder"])
+    assert collection.find("cat").to_json() == before
+    (folder / "a.ogpc").write_bytes(b"half of a file")
+    assert collection.find("cat").to_json() == before
+    (folder / "b.ogpc").unlink()
+    with pytest.raises(OgPointcloudError, match="'cat' is not among the 8 words"):
+        collection.find("cat")
+
+
+def test_endings_in_capitals_are_those_of_scenes_too(folder):
+    og.write_bundle(scene(["desk"]), folder / "a.ogpc").rename(folder / "a.OGPC")
+    collection = indexed(folder, {})
+    assert collection.file(collection.find("desk")[0].scene) == folder / "a.OGPC"
+    assert len(og.segment(folder / "a.OGPC")) == 4
 
 
 def test_given_vectors_are_asked_whatever_words_they_go_by(folder):
@@ -366,6 +397,8 @@ def test_other_files_are_no_atlas(tmp_path):
             og.Collection(tmp_path / "atlas")
     with pytest.raises(OgPointcloudError, match="not a file"):
         og.Collection(tmp_path / "nothing")
+    with pytest.raises(OgPointcloudError, match="is a folder or a device"), Atlas.writing("."):
+        pass
 
 
 def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
@@ -479,12 +512,14 @@ def test_an_atlas_that_changes_while_it_is_asked_is_asked_again(folder, monkeypa
         collection.find("chair")
 
 
-def test_commands(folder, capsys, tmp_path):
+def test_commands(folder, capsys, tmp_path, monkeypatch):
     for k, things in enumerate((["chair", "mug"], ["desk"])):
         og.write_bundle(scene(things, k), folder / f"room{k}.ogpc")
     (folder / "broken.ogpc").write_bytes(b"x")
     atlas, page = str(tmp_path / "atlas"), tmp_path / "found.html"
-    code, out, err = run(capsys, "index", folder, "-o", atlas)
+    with monkeypatch.context() as context:  # a minute for each thousand words of a data set's list
+        context.setattr(og.Collection, "find", None)
+        code, out, err = run(capsys, "index", folder, "-o", atlas)
     assert code == 0
     assert f"2 added, 1 left out, 0 unchanged: 2 scenes with 3 instances in {atlas}" in out
     assert re.fullmatch(rf"Collection\('{re.escape(atlas)}': 2 scenes, \d+ words\)", repr(og.Collection(atlas)))
@@ -539,6 +574,14 @@ def test_pictures_show_the_thing(tmp_path):
     assert orange[80:120, 80:120].mean() > 0.9
     image = random.integers(0, 256, (7, 5, 3)).astype(np.uint8)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png_bytes(image), np.uint8), 1)[..., ::-1], image)
+
+
+def test_without_lancedb_the_extra_is_named(folder, capsys, tmp_path, monkeypatch):
+    og.write_bundle(scene(["desk"]), folder / "a.ogpc")
+    for module in ("lancedb", "pyarrow"):
+        monkeypatch.setitem(sys.modules, module, None)
+    error = error_of(capsys, "index", folder, "-o", tmp_path / "atlas", "--lance", tmp_path / "lance")
+    assert "og-pointcloud[lance]" in error
 
 
 def test_what_lance_has_of_an_atlas_that_changed_since_is_refused(folder, tmp_path, monkeypatch):

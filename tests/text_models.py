@@ -44,7 +44,7 @@ def clip_tokenizer(merges):
     }  # fmt: skip
 
 
-def encoder_files(feature_space=SPACE, width=OUT, tokenizer=None):
+def encoder_files(feature_space=SPACE, width=OUT, tokenizer=None, seed=5):
     """The files of a text encoder that gives each text the vector of its second token: of a word, its first."""
     nodes = [
         helper.make_node("Gather", ["rows", "tokens"], ["all"], axis=0),
@@ -52,7 +52,7 @@ def encoder_files(feature_space=SPACE, width=OUT, tokenizer=None):
     ]
     tokens = helper.make_tensor_value_info("tokens", TensorProto.INT64, ["batch", "length"])
     text = helper.make_tensor_value_info("text", TensorProto.FLOAT, ["batch", width])
-    rows = unit_rows(VOCABULARY, width, seed=5)
+    rows = unit_rows(VOCABULARY, width, seed)
     constants = [numpy_helper.from_array(rows, "rows"), numpy_helper.from_array(np.array(1, np.int64), "second")]
     graph = helper.make_graph(nodes, "encoder", [tokens], [text], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)

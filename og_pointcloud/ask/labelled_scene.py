@@ -363,7 +363,7 @@ def instance_table(
 
 
 def _is_scene(pcd: Any) -> bool:
-    is_file = isinstance(pcd, (str, os.PathLike)) and Path(pcd).suffix == ".ogpc"
+    is_file = isinstance(pcd, (str, os.PathLike)) and Path(pcd).suffix.lower() == ".ogpc"
     return is_file or isinstance(pcd, (LabelledScene, LabelledCloud))
 
 

@@ -88,7 +88,7 @@ def bank_of_encoder(space: FeatureSpace, folder: StrPath | None = None) -> WordB
     """The word bank of a text encoder's folder, or of the encoder found for the space; None if it has none or is of
     another space."""
     encoder = find_encoder(space.name) if folder is None else read_text_encoder(folder)
-    if encoder is None or not FeatureSpace(space.name).accepts(FeatureSpace(encoder.feature_space)):
+    if encoder is None or not FeatureSpace(space.name).accepts(encoder.space):
         return None
     return encoder.word_bank
 
@@ -191,7 +191,7 @@ def encoder_members(source: StrPath, space: FeatureSpace) -> tuple[dict[str, byt
     FeatureSpaceError if it is of another."""
     files = (Path(source).is_file() and read_carried_encoder(source)) or ENCODER.read(Path(source))
     encoder = TextEncoder(files, str(source))
-    space.require(FeatureSpace(encoder.feature_space, encoder.width), f"texts that {source} encodes")
+    space.require(encoder.space, f"texts that {source} encodes")
     return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder
 
 

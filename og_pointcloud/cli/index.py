@@ -10,7 +10,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_option, print_next, replaceable
+import og_pointcloud as og
+from og_pointcloud.cli.common import Parser, add_option, check_output, print_next, replaceable
 from og_pointcloud.errors import OgPointcloudError, counted, printable
 
 
@@ -24,6 +25,9 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.collection.collection import Collection
 
+    check_output("-o", arguments.output, [])
+    if arguments.output.suffix == ".ogpc":
+        raise OgPointcloudError(f"-o is '{arguments.output}'; expected another ending: .ogpc is that of a scene")
     collection = Collection.index(arguments.folder, arguments.output)
     changes = collection.changes
     assert changes is not None
@@ -39,9 +43,10 @@ def run(arguments: argparse.Namespace) -> None:
 
         write_lance(arguments.output, arguments.lance)
         print(f"wrote {arguments.lance}")
-    if collection.words:
+    if with_words := [entry for entry in collection.entries if entry.vocabulary]:
         # The word that fits the largest scene best: the first word of a data set's list may be an airplane.
-        largest = max(collection.entries, key=lambda entry: entry.instances)
-        with suppress(OgPointcloudError):  # no word is known in its feature space
-            for finding in collection.find(collection.words, scenes=largest.name, top=1):
-                print_next("find", arguments.output, finding.word)
+        largest = max(with_words, key=lambda entry: entry.instances)
+        with suppress(OgPointcloudError):  # words of another width than its features
+            table = og.instance_table(collection.file(largest.name), words=1)
+            if best := [row.words[0] for row in table if row.points and row.words]:
+                print_next("find", arguments.output, max(best, key=lambda word: word[1])[0])

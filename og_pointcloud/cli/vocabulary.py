@@ -53,14 +53,11 @@ def run_add(arguments: argparse.Namespace) -> None:
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
     """The text encoder in --text-encoder, else that of the scene's feature space; FeatureSpaceError if they differ."""
     from og_pointcloud.bundle.vocabulary import carried_encoder
-    from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
-    own = og.read_bundle(arguments.bundle).cloud.feature_space
-    folder = arguments.text_encoder
-    encoder = read_text_encoder(folder) if folder else encoder_for(own, carried_encoder(arguments.bundle))
-    encoded = FeatureSpace(encoder.feature_space, encoder.width)
-    FeatureSpace(own).require(encoded, f"texts that {encoder.where} encodes")
+    own, folder = og.read_bundle(arguments.bundle).cloud.space, arguments.text_encoder
+    encoder = read_text_encoder(folder) if folder else encoder_for(own.name, carried_encoder(arguments.bundle))
+    own.require(encoder.space, f"texts that {encoder.where} encodes")
     return encoder
 
 

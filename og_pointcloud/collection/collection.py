@@ -6,6 +6,7 @@ import fnmatch
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -146,7 +147,9 @@ class Collection:
 
     def file(self, scene: str) -> Path:
         """The .ogpc file of a scene, at its path when it was indexed."""
-        return self.root / f"{scene}.ogpc"
+        path = self.root / f"{scene}.ogpc"
+        upper = path.with_suffix(".OGPC")
+        return upper if upper.is_file() and not path.is_file() else path
 
     def find(
         self,
@@ -191,10 +194,7 @@ class Collection:
         asked = [group for group in self._groups if query.scenes_of(group)]
         vectors = [self._vectors(group.family, query) for group in asked]
         if not any(vectors):
-            if query.given is not None and asked:
-                space = FeatureSpace(asked[0].family.feature_space, asked[0].family.width)
-                space.require(FeatureSpace(UNKNOWN_SPACE, query.given.vectors.shape[1]), "label vectors")
-            raise _unanswerable(query.words[0], [group.family for group in asked])
+            raise _unanswerable(query, [group.family for group in asked])
         # The best of each group and word, then the best of all: (sort key, finding).
         ranked = [
             pair
@@ -241,7 +241,7 @@ class Collection:
             known = known | dict(zip(features[0].names, unit_rows(features[0].vectors), strict=True))
         vectors = {name: known[name] for name in query.words if name in known}
         missing = [name for name in query.words if name not in known]
-        if missing and (encoder := self._encoder(family)) is not None and encoder.width == family.width:
+        if missing and (encoder := self._encoder(family)) is not None:
             vectors |= dict(zip(missing, encoder(missing), strict=True))
         return vectors
 
@@ -249,10 +249,14 @@ class Collection:
         """The encoder that a scene of the family carries, else the one found for the feature space. The latter is used
         only if the space has one family here: with several it is unknown which one it belongs to."""
         for entry in family.entries:
-            if entry.encoder and (encoder := carried_encoder(self.file(entry.name))()):
-                return encoder
+            # Since it was indexed, a file may have become damaged, or the scene of another encoder.
+            with suppress(OgPointcloudError):
+                if entry.encoder and (encoder := carried_encoder(self.file(entry.name))()):
+                    family.space.require(encoder.space, "texts that it encodes")
+                    return encoder
         of_space = {id(group.family) for group in self._groups if group.family.feature_space == family.feature_space}
-        return find_encoder(family.feature_space) if len(of_space) == 1 else None
+        encoder = find_encoder(family.feature_space) if len(of_space) == 1 else None
+        return encoder if encoder and family.space.accepts(encoder.space) else None
 
     def _best(self, group: Group, query: _Query, word: str, vector: NDArray[np.float32]) -> list[tuple[float, Finding]]:
         """The best of a group for a word, with their sort keys."""
@@ -332,9 +336,15 @@ def _finding(block: Block, row: int, word: str, score: float) -> Finding:
     return Finding(scene, instance, word, score, (x, y, z), (dx, dy, dz), points, calibrated, score > 0.5)
 
 
-def _unanswerable(word: str, asked: Sequence[Family]) -> OgPointcloudError:
+def _unanswerable(query: _Query, asked: Sequence[Family]) -> OgPointcloudError:
+    word = query.words[0]
     if not asked:
         return OgPointcloudError("no scene has an instance with a feature: nothing can be searched; make masks first")
+    if query.given is not None:
+        asked[0].space.require(FeatureSpace(UNKNOWN_SPACE, query.given.vectors.shape[1]), "label vectors")
+    if query.features is not None and word in query.features[0].names:
+        vocabulary, space = query.features
+        asked[0].space.require(FeatureSpace(space, vocabulary.vectors.shape[1]), "names of text_features")
     known = {name for family in asked for name in family.words}
     return OgPointcloudError(
         f"'{word}' is not among the {len(known)} words of these scenes{did_you_mean(word, known, ' If not')}: give "

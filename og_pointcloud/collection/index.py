@@ -25,7 +25,7 @@ from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.ask.instances import list_instances
 from og_pointcloud.bundle.format import CARRIED_ENCODER
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.cloud import MIN_BANK, UNKNOWN_SPACE, WordBank, unit_rows
+from og_pointcloud.cloud import MIN_BANK, UNKNOWN_SPACE, FeatureSpace, WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import StrPath
@@ -62,7 +62,8 @@ def index(folder: StrPath, path: StrPath, *, progress: bool = True) -> Changes:
     root = Path(folder)
     if not root.is_dir():
         raise OgPointcloudError(f"'{root}' is not a folder; expected a folder of .ogpc files")
-    files = {file.relative_to(root).with_suffix("").as_posix(): file for file in sorted(root.rglob("*.ogpc"))}
+    found = sorted([*root.rglob("*.OGPC"), *root.rglob("*.ogpc")])  # of two that differ in this, the last one counts
+    files = {file.relative_to(root).with_suffix("").as_posix(): file for file in found}
     if not files:
         raise OgPointcloudError(f"'{root}' has no .ogpc files; expected those that og-pointcloud fit wrote")
     added, replaced, left_out = [], [], []
@@ -133,6 +134,11 @@ class Family:
     width: int
     entries: list[SceneEntry] = field(default_factory=list)
     words: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    @property
+    def space(self) -> FeatureSpace:
+        """What vectors must be of to be compared with these scenes' descriptors."""
+        return FeatureSpace(self.feature_space, self.width)
 
     def groups(self) -> list[Group]:
         """The scenes that can be queried, grouped by the bank that judges them."""

@@ -42,9 +42,9 @@ def _database(uri: str) -> Any:
 
 def write_lance(atlas: StrPath, uri: str) -> None:
     """Write a whole atlas to the database at a folder or URI (s3://...), replacing what is there."""
+    database = _database(uri)  # says which extra is missing
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
-    database = _database(uri)
     with Atlas.reading(atlas) as opened:
         written = opened.fingerprint
         for group in (group for family in families(opened, opened.entries()) for group in family.groups()):

@@ -196,8 +196,8 @@ def largest(
         tried = tried[bound[tried] > -np.inf]
         new = np.setdiff1d(tried, known, assume_unique=True)
         known, key = np.append(known, new), np.append(key, key_of(new))
-        # Done when all were tried, or no remaining bound can beat the last key needed.
-        if len(tried) < count or np.partition(key, -top)[-top] >= bound[tried].min():
+        # Done when all were tried, or no remaining bound reaches the last key needed.
+        if len(tried) < count or np.partition(key, -top)[-top] > bound[tried].min():
             order = np.lexsort((known, -key))[:top]
             return known[order], key[order]
         count *= 4

@@ -115,7 +115,7 @@ class Atlas:
         """For one change, which takes effect if the block ends without an error. A missing file is created beside its
         path and moved there at the end: if two processes create it at once, the last one to end wins."""
         path = Path(path)
-        if path.exists() and not (path.is_file() and path.stat().st_size == 0):
+        if path.is_file() and path.stat().st_size:
             with cls._connected(path, "rw") as atlas:
                 atlas._run("BEGIN IMMEDIATE")
                 atlas._check()

@@ -74,6 +74,7 @@ class TextEncoder:
         self.manifest = ENCODER.checked(files, where, _check_fields)
         self.feature_space: str = self.manifest["feature_space"]
         self.width: int = self.manifest["width"]
+        self.space = FeatureSpace(self.feature_space, self.width)
         self.context_length: int = self.manifest["context_length"]
         self.templates: tuple[str, ...] = tuple(self.manifest["templates"])
         self.precision: str = self.manifest["precision"]
@@ -165,7 +166,7 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     or contain encoders. None if there is none; OgPointcloudError if there is one that cannot be used.
     """
     if carried is not None and (encoder := carried()):
-        if not FeatureSpace(feature_space).accepts(FeatureSpace(encoder.feature_space)):
+        if not FeatureSpace(feature_space).accepts(encoder.space):
             raise FeatureSpaceError(
                 f"{encoder.where} has feature space '{encoder.feature_space}', the scene has '{feature_space}', and "
                 "vectors of two spaces cannot be compared: store the scene's own (og-pointcloud export --help)"
