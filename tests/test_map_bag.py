@@ -332,6 +332,8 @@ def test_compressed_depth_in_meters_is_unpacked():
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read == 0, depth == 0)
     np.testing.assert_allclose(read[depth > 0], depth[depth > 0], rtol=1e-3)
+    with pytest.raises(SceneError, match=r"is coded by RVL; expected PNG: set the publisher's compressedDepth format"):
+        compressed_image_array(SimpleNamespace(format="16UC1; compressedDepth rvl", data=data))
     with pytest.raises(SceneError, match="compressedDepth of 32FC1 holds uint8"):
         compressed_image_array(
             SimpleNamespace(format=message.format, data=np.r_[data[:12], png(stored.astype(np.uint8))])

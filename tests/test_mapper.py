@@ -9,6 +9,7 @@ import sys
 import textwrap
 import time
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -209,13 +210,36 @@ def test_more_loops_of_one_path_keep_no_more():
     assert mapper.points < 1.01 * points
 
 
+def lowered(given, by=0.5):
+    """The frames with poses that are wrong."""
+    off = np.eye(4)
+    off[2, 3] = by
+    return [replace(f, camera=replace(f.camera, world_to_camera=f.camera.world_to_camera @ off)) for f in given]
+
+
+def poses_of(given):
+    return {frame.stamp: frame.camera.world_to_camera for frame in given}
+
+
+def test_a_loop_closure_moves_where_things_stood_too():
+    """What is gone meanwhile was seen by frames that are corrected; so was the home of what returned."""
+    given = [*frames(THINGS), *frames([CHEST, BIN], seed=1, first=100.0)]
+    mapper, _ = mapped(lowered(given))
+    mapper.correct(poses_of(given))
+    (gone,) = (entry for entry in mapper.objects() if entry.state == "gone")
+    middle = np.array(CRATE.low) + np.array(CRATE.size) / 2
+    assert np.abs([gone.place - middle, gone.box.center - middle]).max() < 0.25
+    given += frames(THINGS, seed=2, first=200.0)
+    (back,) = (one for frame in given[28:] for one in mapper.integrate(frame).moved)
+    assert np.abs([back.before - middle, back.after - middle]).max() < 0.25
+    mapper.correct(poses_of(lowered(given)))
+    assert {entry.state for entry in mapper.objects()} == {"present"}, "it stands where it stood"
+
+
 def test_a_loop_closure_moves_what_its_frames_brought():
     given = frames(THINGS)
-    off = np.eye(4)
-    off[:3, 3] = 0.0, 0.0, 0.5
-    wrong = [replace(f, camera=replace(f.camera, world_to_camera=f.camera.world_to_camera @ off)) for f in given]
-    mapper, _ = mapped([replace(frame, stamp=float(k)) for k, frame in enumerate(wrong)])
-    mapper.correct({float(k): frame.camera.world_to_camera for k, frame in enumerate(given)})
+    mapper, _ = mapped(lowered(given))
+    mapper.correct(poses_of(given))
     right, _ = mapped(given)
     np.testing.assert_allclose(
         np.sort(mapper.snapshot().xyz[:, 2])[::50], np.sort(right.snapshot().xyz[:, 2])[::50], atol=0.01
@@ -266,6 +290,7 @@ def bad_frames():
         "rgb is <U1": replace(frame, rgb="x"),
         "rgb is": replace(frame, rgb=frame.rgb[..., :2]),
         "stamp is nan": replace(frame, stamp=np.nan),
+        r"stamp is 1000\d+; expected a finite number": replace(frame, stamp=10**400),
     }
 
 
@@ -602,11 +627,12 @@ def test_ids_that_a_snapshot_gave_are_not_given_again_after_a_kill(tmp_path):
 
 
 def test_frames_of_one_stamp_and_corrections_are_in_the_journal(tmp_path):
-    given = [replace(frame, stamp=float(k // 2)) for k, frame in enumerate(frames(THINGS)[:4])]  # two cameras at a time
+    stamps = Fraction(0), Fraction(0), 1, 1, Fraction(5, 2)  # two cameras at a time, then one
+    given = [replace(frame, stamp=stamp) for stamp, frame in zip(stamps, frames(THINGS), strict=False)]
     mapper, _ = mapped(given, journal=tmp_path)
-    turn = np.eye(4)
-    turn[:3, 3] = 0.3, 0.0, 0.0
-    mapper.correct({0.0: given[0].camera.world_to_camera @ turn})
+    with pytest.raises(SceneError, match="frames of stamp 0 have different poses, as of two cameras"):
+        mapper.correct(poses_of(given))
+    mapper.correct(poses_of(lowered(given[4:])))
     again = og.Mapper(feature_space=SPACE, journal=tmp_path)
     np.testing.assert_array_equal(again._map.points.xyz, mapper._map.points.xyz)
     assert [thing.views for thing in again.objects()] == [thing.views for thing in mapper.objects()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -87,8 +88,10 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
     if not isinstance(frame, Frame):
         raise SceneError(f"a frame is a {type(frame).__name__}; expected an og.Frame")
     stamp = stamp if frame.stamp is None else frame.stamp
-    if not isinstance(stamp, Real) or not np.isfinite(stamp):
-        raise SceneError(f"frame stamp is {stamp!r}; expected a finite number: seconds, or a count")
+    # Compared, which fractions and whole numbers of any size can be; NaN is not at most anything.
+    if not (isinstance(stamp, Real) and abs(stamp) <= sys.float_info.max):
+        raise SceneError(f"frame stamp is {stamp!r:.80}; expected a finite number: seconds, or a count")
+    stamp = float(stamp)
     name = f"frame {stamp:.15g}"
     if frame.camera is None:
         raise SceneError(f"{name} has no camera; expected an og.Camera with its pose: drop frames that lost track")
@@ -107,7 +110,7 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
     if rgb is not None and (rgb.shape != (camera.height, camera.width, 3) or rgb.dtype != np.uint8):
         raise SceneError(f"{name}: rgb is {rgb.dtype} {rgb.shape}; expected uint8 ({camera.height}, {camera.width}, 3)")
     view = view_of_depth(depth, camera) if depth.any() else None
-    return CheckedFrame(camera, ids, features, view, rgb, float(stamp), space)
+    return CheckedFrame(camera, ids, features, view, rgb, stamp, space)
 
 
 def in_arrays(frame: Frame) -> Frame:

@@ -38,6 +38,9 @@ READINGS_PER_SPACING = 1.5
 """Depth readings of a frame used per spacing, along each image axis: more would only be averaged."""
 MAX_BALANCE = 3.0
 """A point's history counts as at most this many frames, for it or against it."""
+MIN_SAME_POSE_COSINE = 0.995
+"""Two frames of one stamp have different poses if one is turned against the other by more than this cosine (5.7
+degrees), or stands farther from it than the points' spacing."""
 RECENT_FRAMES = 4096
 """Number of latest frames whose stamps are kept: they tell since when an object has been where it is."""
 
@@ -172,7 +175,17 @@ class GrowingMap:
         if strange := [stamp for stamp in poses if not isinstance(stamp, Real)]:
             raise SceneError(f"a pose is given for frame {strange[0]!r}; expected the frame's stamp, a number")
         cameras = {float(t): Camera(1, 1, 1.0, 1.0, 0.5, 0.5, numbers_of(pose)) for t, pose in poses.items()}
-        known = {*self.recent, *(stamp for stamp, _ in self.anchors), *(view.stamp for view in self.kept.views)}
+        placed = [*self.anchors, *((view.stamp, view.camera.world_to_camera) for view in self.kept.views)]
+        first = dict(reversed(placed))
+        for stamp, pose in ((stamp, pose) for stamp, pose in placed if stamp in cameras):
+            apart = first[stamp] @ np.linalg.inv(pose)
+            turned = apart[:3, :3].trace() < 1 + 2 * MIN_SAME_POSE_COSINE
+            if turned or np.linalg.norm(apart[:3, 3]) > self.points.edge:
+                raise SceneError(
+                    f"frames of stamp {stamp:.15g} have different poses, as of two cameras; expected one that the "
+                    "corrected pose replaces: give the frames of each camera stamps of their own"
+                )
+        known = {*self.recent, *first}
         strange = [stamp for stamp in cameras if stamp not in known and stamp >= self.remembered_since]
         some = ", ".join(f"{stamp:.15g}" for stamp in strange[:3]) + ", ..." * (len(strange) > 3)
         if strange and len(strange) == len(cameras):  # seconds instead of nanoseconds, say
@@ -184,15 +197,23 @@ class GrowingMap:
         return cameras
 
     def correct(self, cameras: Mapping[float, Camera]) -> None:
-        """Move the points that the frames of these stamps added. cameras: from `checked_poses`."""
+        """Move the points that the frames of these stamps added, and where these points say that things stood.
+        cameras: from `checked_poses`."""
         corrected = {stamp: in_local_frame(camera, self.origin).world_to_camera for stamp, camera in cameras.items()}
         for index, (stamp, old) in enumerate(self.anchors):
-            if stamp in corrected:
-                # A point keeps its place in the frame of its camera: out of the old pose, into the corrected one.
-                rows = np.flatnonzero(self.points.anchor == index)
-                motion = np.linalg.inv(corrected[stamp]) @ old
-                self.points.xyz[rows] = self.points.xyz[rows] @ motion[:3, :3].T + motion[:3, 3]
-                self.anchors[index] = stamp, corrected[stamp]
+            if stamp not in corrected:
+                continue
+            # A point keeps its place in the frame of its camera: out of the old pose, into the corrected one.
+            motion = np.linalg.inv(corrected[stamp]) @ old
+            rows = np.flatnonzero(self.points.anchor == index)
+            self.points.xyz[rows] = self.points.xyz[rows] @ motion[:3, :3].T + motion[:3, 3]
+            self.anchors[index] = stamp, corrected[stamp]
+            turn, shift = motion[:3, :3], motion[:3, 3] + self.origin
+            for track in self.tracks.tracks:
+                if track.left and track.left_anchor == index:
+                    track.left = track.left.moved_to(turn @ (track.left.place - self.origin) + shift)
+                if track.home is not None and track.home_anchor == index:
+                    track.home = turn @ (track.home - self.origin) + shift
         for index, view in enumerate(self.kept.views):
             if view.stamp in corrected:
                 camera = replace(view.camera, world_to_camera=corrected[view.stamp])

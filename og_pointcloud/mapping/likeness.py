@@ -13,7 +13,7 @@ only rule a match out: exposure, shade and occlusion change both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,6 +67,10 @@ class Look:
         color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
         bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)], np.float64) + origin
         return cls(descriptors, spread, place, color, bounds, float(sides.max()))
+
+    def moved_to(self, place: NDArray[np.float64]) -> Look:
+        """The look of the thing elsewhere; its bounds keep their size."""
+        return replace(self, place=place, bounds=self.bounds + (place - self.place))
 
     def has_color_of(
         self, other: Look, limit: float = SAME_COLOR_LEVELS, shift: NDArray[np.float64] | float = 0.0

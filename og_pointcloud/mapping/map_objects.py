@@ -93,6 +93,7 @@ def _has_left(map_: GrowingMap, k: int, stamp: float) -> bool:
     leaving = np.setdiff1d(rows, still)
     gone = np.append(np.array(track.lost, np.int32), leaving)
     track.left, track.left_at, track.lost = _look(map_, k, gone), track.sequence, []
+    track.left_anchor = int(np.bincount(map_.points.anchor[gone] + 1).argmax()) - 1
     map_.points.weight[leaving], seen_at = 0, map_.presence.seen_at
     seen_at[leaving] = np.maximum(seen_at[leaving], stamp)  # a late frame must not bring them back
     map_.forget(rows)
@@ -155,6 +156,8 @@ def _reidentified(map_: GrowingMap, k: int, scale: LikenessScale) -> list[Moved]
     assert gone.left is not None
     moved = Moved(best, gone.left.place, map_.place_of(came[best]), best)
     # The id passes to this track; the old one, without points, is dropped at the next pruning.
-    track.id, track.home = best, gone.left.place if gone.home is None else gone.home
+    track.id, track.home, track.home_anchor = best, gone.home, gone.home_anchor
+    if gone.home is None:
+        track.home, track.home_anchor = gone.left.place, gone.left_anchor
     gone.id, gone.left = NO_TRACK, None
     return [moved]

@@ -106,7 +106,7 @@ class Mapper:
         if spacing is not None and not (start is None and cloud is None):
             raise SceneError(f"spacing is {spacing:g}, but a map or a cloud is given, which has its own: leave it out")
         self.settings = fit_settings(settings)
-        self._space, self._spacing = FeatureSpace(feature_space), spacing
+        self._space, self._spacing = FeatureSpace(feature_space), None if spacing is None else float(spacing)
         scene = None if start is None else as_scene(start)
         self._base, self._base_file = (scene.cloud, scene.path) if scene else (None, None)
         self._map: GrowingMap | None = None
@@ -282,9 +282,10 @@ class Mapper:
         """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world
         coordinates.
 
-        Points move with the frame that added them, kept views with theirs; the points of a known cloud stay. SceneError
-        for an invalid pose, or if no stamp is a frame's; then nothing moves. If only some are, a warning names the
-        others, such as those of refused frames.
+        Points move with the frame that added them, kept views with theirs, and so do the places of things that left; the
+        points of a known cloud stay. SceneError for an invalid pose, if no stamp is a frame's, or if frames of one stamp
+        have different poses; then nothing moves. If only some are, a warning names the others, such as those of refused
+        frames.
         """
         if not isinstance(poses, Mapping):
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")

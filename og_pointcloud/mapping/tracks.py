@@ -72,7 +72,8 @@ class Track:
     where it stood before it first left, world coordinates, None for what never came back. box: (2, 3) lowest and
     highest coordinates of points that voted for it. lost: rows of its points removed as seen through; losing_since:
     stamp of the first of these. left: its look, once most were removed; left_at: the frame that last showed it:
-    whatever was elsewhere by then is something else."""
+    whatever was elsewhere by then is something else. left_anchor, home_anchor: of the frame that brought most of the
+    points that left or home stand for: they move with it; -1 none."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -88,6 +89,8 @@ class Track:
     losing_since: float = -np.inf
     left: Look | None = None
     left_at: int = 0
+    left_anchor: int = -1
+    home_anchor: int = -1
 
     def extend_box(self, box: NDArray[np.float64]) -> None:
         """Enlarge the box to hold another (2, 3)."""
@@ -100,7 +103,9 @@ class Track:
             self.total = other.total if self.total is None else self.total + other.total
         for name in ("pixels", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.home, self.first = other.home if self.home is None else self.home, min(self.first, other.first)
+        self.first = min(self.first, other.first)
+        if self.home is None:
+            self.home, self.home_anchor = other.home, other.home_anchor
         self.extend_box(other.box)
         for name in ("views", "last_seen", "sequence"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))

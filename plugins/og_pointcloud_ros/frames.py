@@ -72,10 +72,14 @@ def compressed_image_array(message: Any) -> NDArray[Any]:
     cameras' drivers only "jpeg" or "png". SceneError where it cannot be decoded.
     """
     encoding, _, how = str(message.format).partition(";")
+    name = f"an image of format '{printable(message.format, 40)}'"
     data, start = np.asarray(message.data, np.uint8), DEPTH_HEADER if "compressedDepth" in how else 0
-    read = decoded_bytes(
-        data[start:], require_cv2().IMREAD_UNCHANGED, f"an image of format '{printable(message.format, 40)}'"
-    )
+    if start and "rvl" in how.lower():
+        raise SceneError(
+            f"{name} is coded by RVL; expected PNG: set the publisher's compressedDepth format to png, or take the "
+            "uncompressed topic"
+        )
+    read = decoded_bytes(data[start:], require_cv2().IMREAD_UNCHANGED, name)
     pixels: NDArray[Any] = np.asarray(read)
     if start and encoding.strip() == "32FC1":
         if pixels.dtype != np.uint16 or pixels.ndim != 2:
