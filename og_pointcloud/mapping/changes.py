@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
-from og_pointcloud.cloud import BACKGROUND, LabelledCloud
+from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
 from og_pointcloud.journal import with_bar
 from og_pointcloud.mapping.likeness import (
@@ -54,6 +54,13 @@ SMALL_PIECE_SHARE = 0.5
 """A piece is small if it has less than this share of the other's points."""
 MANY_THINGS, MAX_CHANGED_SHARE = 4, 0.5
 """If more than this share of so many things left or moved, a warning asks whether the frames differ."""
+OTHER_UNIT_RATIO, RATIO_ERROR, RATIOS_TRIED = 1.25, 0.1, 41
+"""Things that are typically this many times as long ask for another unit of length; it is searched for within this
+share of that ratio, in so many steps."""
+UNIT_THINGS, UNIT_POINTS = 200, 5000
+"""Number of things, the largest, and of points that this takes."""
+MAX_OFF_SHARE = 0.5
+"""The unit differs if the right one leaves less than this share of the points that lie off the other visit."""
 MAX_THROUGH_SHARE = 0.5
 """If more than this share of the points measured again or seen through is seen through, the frames differ."""
 
@@ -155,7 +162,7 @@ def compare_visits(
     missing = np.zeros(len(a))  # depth images lack no points
     # What the later views say about both; where frames were judged one by one, the map has counted it already.
     if again is None:
-        _require_one_unit(a, b)
+        _require_one_unit(earlier, later)
         views = with_bar(later.measured(), "now", len(b.cameras), progress and later.depth is None)
         still_there, own = Presence.from_views(views, tolerance, a.xyz, b.xyz)
         _require_one_frame(still_there)
@@ -183,16 +190,39 @@ def _warn_of_many_changes(changes: Changes, things: int) -> None:
         )
 
 
-def _require_one_unit(a: LabelledCloud, b: LabelledCloud) -> None:
-    """SceneError where all points of one visit lie closer together than the other's neighbors: within what is tolerated
-    as noise, so that every one of them would count as measured again."""
-    for coarse, fine, which in ((b, a, "earlier"), (a, b, "later")):
-        extent = float(np.linalg.norm(fine.xyz.max(axis=0).astype(np.float64) - fine.xyz.min(axis=0)))
-        if 0 < extent < coarse.spacing:  # 0: of a single point
-            raise SceneError(
-                f"all points of the {which} visit lie within {extent:.3g}, the other's are {coarse.spacing:.3g} apart: "
-                "the two seem to be in different units of length: scale one of them"
-            )
+def _require_one_unit(earlier: Visit, later: Visit) -> None:
+    """SceneError where things are longer in one visit, and shrinking it by as much about the world's origin brings it
+    onto the other. A later visit of another part, or with other things, fits best as it is."""
+    lengths = _lengths_of_alike(earlier, later)
+    ratio = float(np.median(lengths[1] / lengths[0])) if lengths.shape[1] >= MIN_UNMOVED_THINGS else 1.0
+    small, large = (earlier.cloud, later.cloud) if ratio > 1 else (later.cloud, earlier.cloud)
+    if max(ratio, 1 / ratio) < OTHER_UNIT_RATIO:
+        return
+    xyz = large.xyz_world[:: 1 + len(large) // UNIT_POINTS]
+    units = [1.0, *(max(ratio, 1 / ratio) * np.linspace(1 - RATIO_ERROR, 1 + RATIO_ERROR, RATIOS_TRIED))]
+    tree, reach = cKDTree(small.xyz), SAME_SURFACE_SPACINGS * small.spacing
+    off = [float(np.mean(nearest_in(tree, xyz / unit - small.origin)[0] > reach)) for unit in units]
+    if min(off) < MAX_OFF_SHARE * off[0]:
+        raise SceneError(
+            f"things of the later visit are {float(f'{ratio:.3g}'):g} times as long as those of the earlier one, and "
+            "all of it is: the two seem to be in different units of length: scale one of them"
+        )
+
+
+def _lengths_of_alike(earlier: Visit, later: Visit) -> NDArray[np.float64]:
+    """(2, m) lengths in both visits of the largest things that are most like each other."""
+    visits, chosen = (earlier, later), []
+    for table in (visit.cloud.instances for visit in visits):
+        described = np.flatnonzero(np.bincount(table.descriptor_instance, minlength=len(table)) * table.points > 0)
+        chosen.append(described[np.argsort(-table.points[described], kind="stable")[:UNIT_THINGS]])
+    if not all(map(len, chosen)):
+        return np.zeros((2, 0))
+    alike = cosines(earlier.cloud.instances, chosen[0], later.cloud.instances, chosen[1])
+    partner = alike.argmax(axis=1)
+    one = np.flatnonzero(alike.argmax(axis=0)[partner] == np.arange(len(partner)))
+    pairs = zip(visits, (chosen[0][one], chosen[1][partner[one]]), strict=True)
+    lengths = [[visit.look(k, visit.rows[k]).length for k in ids.tolist()] for visit, ids in pairs]
+    return np.maximum(np.array(lengths, np.float64).reshape(2, -1), 1e-12)
 
 
 def _require_one_frame(now: Presence) -> None:

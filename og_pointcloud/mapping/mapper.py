@@ -282,10 +282,10 @@ class Mapper:
         """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world
         coordinates.
 
-        Points move with the frame that added them, kept views with theirs, and so do the places of things that left; the
-        points of a known cloud stay. SceneError for an invalid pose, if no stamp is a frame's, or if frames of one stamp
-        have different poses; then nothing moves. If only some are, a warning names the others, such as those of refused
-        frames.
+        Points move with the frame that added them, kept views with theirs, and so do the places of things that left;
+        the points of a known cloud stay. SceneError for an invalid pose, if no stamp is a frame's, or if frames of one
+        stamp have different poses; then nothing moves. If only some stamps are, a warning names the others, such as
+        those of refused frames.
         """
         if not isinstance(poses, Mapping):
             raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
