@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tracemalloc
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -445,6 +446,16 @@ def test_a_visit_in_another_unit_is_refused(monday, friday, unit):
     """With one origin, so that the floor lies on the floor; one thing left, one moved, one came."""
     with pytest.raises(SceneError, match=r"times as long as .* different units of length"):
         og.compare(monday, scaled(friday, unit))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("spacings", "told"), [(0.5, False), (1.5, True), (3, True)])
+def test_a_visit_that_is_a_little_off_is_doubted(monday, friday, spacings, told):
+    """Sideways, where the floor tells nothing."""
+    aside = replace(friday, origin=friday.origin + spacings * monday.spacing * np.array([0.8, 0.6, 0.0]))
+    doubt = pytest.raises(UserWarning, match=r"lies about 0\.0\d+ off the earlier one, .* register their poses")
+    with doubt if told else nullcontext():
+        og.compare(monday, aside)
 
 
 def test_a_visit_that_seems_to_move_most_things_is_doubted(monday):

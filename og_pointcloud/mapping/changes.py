@@ -41,7 +41,14 @@ from og_pointcloud.mapping.likeness import (
     typical_cosine,
 )
 from og_pointcloud.mapping.map_record import MapRecord
-from og_pointcloud.mapping.presence import MIN_POINTS, Evidence, Presence, Visit, tolerance_of
+from og_pointcloud.mapping.presence import (
+    MIN_POINTS,
+    TOLERANCE_SPACINGS,
+    Evidence,
+    Presence,
+    Visit,
+    tolerance_of,
+)
 from og_pointcloud.rendering.geometry import nearest_in
 
 SAME_SURFACE_SPACINGS = 1.5
@@ -57,8 +64,11 @@ MANY_THINGS, MAX_CHANGED_SHARE = 4, 0.5
 OTHER_UNIT_RATIO, RATIO_ERROR, RATIOS_TRIED = 1.25, 0.1, 41
 """Things that are typically this many times as long ask for another unit of length; it is searched for within this
 share of that ratio, in so many steps."""
-UNIT_THINGS, UNIT_POINTS = 200, 5000
-"""Number of things, the largest, and of points that this takes."""
+LARGEST_THINGS, COMPARED_POINTS = 200, 5000
+"""Number of things and points by which units and places of two visits are compared."""
+OFFSET_ROUNDS, OFFSET_REACH_SPACINGS, OFFSET_DAMPING = 6, 4.0, 0.03
+"""Steps of the search for one offset of all points; how far it reaches; share of all surfaces that must face a
+direction to tell an offset along it."""
 MAX_OFF_SHARE = 0.5
 """The unit differs if the right one leaves less than this share of the points that lie off the other visit."""
 MAX_THROUGH_SHARE = 0.5
@@ -166,6 +176,7 @@ def compare_visits(
         views = with_bar(later.measured(), "now", len(b.cameras), progress and later.depth is None)
         still_there, own = Presence.from_views(views, tolerance, a.xyz, b.xyz)
         _require_one_frame(still_there)
+        _warn_of_offset(earlier, later)
         again, shows = (still_there.present, still_there.absent), own.present
         if later.depth is None:
             missing = still_there.missing(nearest_in(cKDTree(b.xyz), a.xyz)[0] > spacing)
@@ -198,7 +209,7 @@ def _require_one_unit(earlier: Visit, later: Visit) -> None:
     small, large = (earlier.cloud, later.cloud) if ratio > 1 else (later.cloud, earlier.cloud)
     if max(ratio, 1 / ratio) < OTHER_UNIT_RATIO:
         return
-    xyz = large.xyz_world[:: 1 + len(large) // UNIT_POINTS]
+    xyz = large.xyz_world[:: 1 + len(large) // COMPARED_POINTS]
     units = [1.0, *(max(ratio, 1 / ratio) * np.linspace(1 - RATIO_ERROR, 1 + RATIO_ERROR, RATIOS_TRIED))]
     tree, reach = cKDTree(small.xyz), SAME_SURFACE_SPACINGS * small.spacing
     off = [float(np.mean(nearest_in(tree, xyz / unit - small.origin)[0] > reach)) for unit in units]
@@ -214,7 +225,7 @@ def _lengths_of_alike(earlier: Visit, later: Visit) -> NDArray[np.float64]:
     visits, chosen = (earlier, later), []
     for table in (visit.cloud.instances for visit in visits):
         described = np.flatnonzero(np.bincount(table.descriptor_instance, minlength=len(table)) * table.points > 0)
-        chosen.append(described[np.argsort(-table.points[described], kind="stable")[:UNIT_THINGS]])
+        chosen.append(described[np.argsort(-table.points[described], kind="stable")[:LARGEST_THINGS]])
     if not all(map(len, chosen)):
         return np.zeros((2, 0))
     alike = cosines(earlier.cloud.instances, chosen[0], later.cloud.instances, chosen[1])
@@ -238,6 +249,35 @@ def _require_one_frame(now: Presence) -> None:
     if not met:
         what = f"the later visit looks at none of the earlier visit's {len(now.balance):,} points: they do not overlap"
         warnings.warn(f"{what}, or are not in the same world frame, so changes are unknown", stacklevel=4)
+
+
+def _warn_of_offset(earlier: Visit, later: Visit) -> None:
+    """A warning where one motion brings the surfaces of the later visit onto the earlier one's, and it is longer than
+    the points' spacing. Fitted from points to planes (Chen and Medioni, 1992), each weighted by its nearness, as what
+    changed lies far off; directions along which most surfaces extend show no offset, and are damped."""
+    surface, spacing = earlier.surface, max(earlier.cloud.spacing, later.cloud.spacing)
+    xyz = later.surface.xyz[:: 1 + len(later.cloud) // COMPARED_POINTS].astype(np.float64)
+    tree, start, middle = cKDTree(surface.xyz), xyz, np.median(xyz, axis=0)
+    size = max(float(np.median(np.linalg.norm(xyz - middle, axis=1))), spacing)
+    for _ in range(OFFSET_ROUNDS):
+        distance, nearest = nearest_in(tree, xyz)
+        near = distance < OFFSET_REACH_SPACINGS * spacing
+        to, normal = surface.xyz[nearest[near]] - xyz[near], surface.normal[nearest[near]].astype(np.float64)
+        off = np.einsum("na,na->n", to, normal)
+        # Its change by a shift along each axis, and by a turn around each.
+        change = np.c_[normal, np.cross((xyz[near] - middle) / size, normal)]
+        weighted = change / np.maximum(np.abs(off), TOLERANCE_SPACINGS * spacing)[:, None]
+        normal_equations = weighted.T @ change
+        damping = OFFSET_DAMPING * np.trace(normal_equations[:3, :3]) + 1e-12
+        shift, turn = np.split(np.linalg.solve(normal_equations + damping * np.eye(6), weighted.T @ off), 2)
+        xyz = xyz + shift + np.cross(turn, (xyz - middle) / size)
+    moved = float(np.median(np.linalg.norm(xyz - start, axis=1)))
+    if moved > spacing:
+        warnings.warn(
+            f"the later visit lies about {moved:.2g} off the earlier one, {moved / spacing:.2g} times the distance of "
+            "its points, so what is near a surface may seem to have come or gone: register their poses first",
+            stacklevel=4,
+        )
 
 
 @dataclass(frozen=True)
