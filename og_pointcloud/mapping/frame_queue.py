@@ -45,11 +45,10 @@ class FrameQueue:
         with suppress(Exception):  # anything but a frame of arrays is refused, and reported, in its turn
             frame = deepcopy(in_arrays(frame))
         with self._gate:  # never held for long
-            if not self._closed:
+            if not (closed := self._closed):
                 self._waiting.put((time.monotonic(), frame))
-                return
-            self.dropped += 1
-        self._on_drop(f"a frame came after the queue was closed: {self.dropped} dropped so far")
+        if closed:
+            self._drop("a frame came after the queue was closed")
 
     def close(self) -> None:
         """Process the waiting frames that are not too old, and end the thread."""
@@ -67,8 +66,7 @@ class FrameQueue:
 
     def _take(self, arrived: float, frame: Frame) -> None:
         if time.monotonic() - arrived > self.max_age:
-            self.dropped += 1
-            self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
+            self._drop(f"a frame waited longer than {self.max_age} s")
             return
         change = None
         try:
@@ -81,3 +79,7 @@ class FrameQueue:
             else:
                 what = "a frame failed" if change is None else "a frame was added, but on_change failed"
                 self._on_drop(f"{what}: {type(error).__name__}: {error}")
+
+    def _drop(self, why: str) -> None:
+        self.dropped += 1
+        self._on_drop(f"{why}: {self.dropped} dropped so far")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from og_pointcloud.journal import Journal
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points
 from og_pointcloud.mapping.kept_views import KeptView
+from og_pointcloud.mapping.merging import joined
 from og_pointcloud.rendering.geometry import Neighborhood, drawn_spacing, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
@@ -98,16 +99,7 @@ def matched_ids(
 
 def with_ids(cloud: LabelledCloud, wanted: NDArray[np.int64], count: int) -> LabelledCloud:
     """The cloud with instance k called wanted[k], in a table of ``count`` rows; rows without an instance are empty."""
-    table, empty = cloud.instances, {"coarse": -1, "part_of": -1, "reliability": np.nan}
-    columns = {}
-    for entry in fields(InstanceTable)[2:]:  # all but the descriptors and their owners
-        rows = getattr(table, entry.name)
-        columns[entry.name] = np.full(count, empty.get(entry.name, 0), rows.dtype)
-        columns[entry.name][wanted] = rows
-    number = np.append(wanted, [-2, -1])  # states -2 and -1 index the last two
-    columns["part_of"][wanted] = np.where(table.part_of >= 0, number[table.part_of], -1)
-    # Rows of descriptors stay in the order of their instances.
-    owner = wanted[table.descriptor_instance]
-    order = np.argsort(owner, kind="stable")
-    renamed = InstanceTable(table.descriptors[order], owner[order].astype(np.int32), **columns)
-    return replace(cloud, instance_ids=number[cloud.instance_ids].astype(np.int32), instances=renamed)
+    ids = np.append(wanted, [-2, -1])[cloud.instance_ids].astype(np.int32)  # states -2 and -1 index the last two
+    none, no_share = np.zeros(0, np.int32), np.zeros(0, np.float32)
+    nothing = InstanceTable(cloud.instances.descriptors[:0], none, none, none, none, no_share, no_share)
+    return replace(cloud, instance_ids=ids, instances=joined(nothing, cloud.instances, wanted, ids, count))

@@ -176,13 +176,14 @@ def _relabelled(
 
 
 def joined(
-    a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], ids: NDArray[np.integer]
+    a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], ids: NDArray[np.integer], count: int = 0
 ) -> InstanceTable:
     """Both tables as one: counts under one id add up, means are weighted by the number of masks.
 
-    ids_of_b: (len(b),) new id of each instance of b; those of a keep theirs. ids: (n,) of all points.
+    ids_of_b: (len(b),) new id of each instance of b; those of a keep theirs. ids: (n,) of all points. count: rows that
+    the table has at least; those without an instance are empty.
     """
-    count = max(len(a), int(ids_of_b.max(initial=-1)) + 1)
+    count = max(len(a), count, int(ids_of_b.max(initial=-1)) + 1)
     owner = np.concatenate([np.arange(len(a)), ids_of_b])
 
     def total(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.float64]:

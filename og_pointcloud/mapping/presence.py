@@ -79,14 +79,14 @@ class Presence(Columns):
     def from_views(views: Iterable[MeasuredView], tolerance: float, *clouds: NDArray[np.float32]) -> list[Presence]:
         """Evidence of views about all points of each cloud (n, 3). Views are iterated once, as each may be read or
         drawn lazily."""
-        presences = [Presence(tolerance) for _ in clouds]
-        for presence, xyz in zip(presences, clouds, strict=True):
+        known = [(Presence(tolerance), xyz) for xyz in clouds]
+        for presence, xyz in known:
             presence.grow(len(xyz))
         for view in views:
-            for presence, xyz in zip(presences, clouds, strict=True):
+            for presence, xyz in known:
                 states = states_of_points(xyz, tolerance, view)
                 presence.add_states(np.arange(len(xyz)), xyz, states, view.camera.center, 0.0)
-        return presences
+        return [presence for presence, _ in known]
 
     def add_states(
         self, rows: NDArray[np.integer], xyz: NDArray[np.float32], states: NDArray[np.int8],
