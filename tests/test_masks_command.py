@@ -140,8 +140,12 @@ def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             make_masks(tmp_path / "c", QUICK, progress=False)
     assert not (tmp_path / "c" / "masks").exists()
+    (tmp_path / "c" / PREVIEW_NAME).unlink()  # killed before the preview, or while the record was first written
+    (tmp_path / "c" / "masks").mkdir()
+    (tmp_path / "c" / "masks" / ".made.json.0123abcd.tmp").write_text("{")
     made = make_masks(tmp_path / "c", QUICK, progress=False)
     assert made.done_before == made.images == 4
+    assert (tmp_path / "c" / PREVIEW_NAME).read_bytes() == (tmp_path / "whole" / PREVIEW_NAME).read_bytes()
     for name in world.names:
         assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
 
@@ -357,6 +361,26 @@ def test_other_masks_in_the_folder_of_the_proposer_are_taken_up(tmp_path):
             write_image(tmp_path / "given" / f"{name}.png", ids)
         make_masks(tmp_path / "c", MaskSettings(str(tmp_path / "given"), encoder=None), progress=False)
         assert ((ids_of(tmp_path / "c", world.names[0]) > 0) == (ids > 0)).all()
+
+
+def test_the_folder_of_the_proposer_may_be_the_capture_but_not_its_masks(tmp_path, monkeypatch):
+    """Masks were made again on every run, or, their ids renumbered, of themselves."""
+    capture, names = tmp_path / "c", make_capture(tmp_path / "c", 2).names
+    square = {"segmentation": [[9, 9, 29, 9, 29, 29, 9, 29]]}
+    images = [{"id": k, "file_name": f"{name}.png", "height": HEIGHT, "width": WIDTH} for k, name in enumerate(names)]
+    coco = {"images": images, "annotations": [{"image_id": k, **square} for k in range(2)]}
+    (capture / "annotations.json").write_text(json.dumps(coco))
+    settings = MaskSettings(str(capture), encoder=None)
+    with monkeypatch.context() as patch:
+        patch.setattr("og_pointcloud.masking.make_masks._assemble", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_masks(capture, settings, progress=False)
+    assert [make_masks(capture, settings, progress=False).done_before for _ in range(2)] == [2, 2]
+    before = ids_of(capture, names[0])
+    of_itself = MaskSettings(str(capture / "masks"), encoder=None)
+    with pytest.raises(OgPointcloudError, match=r"would be replaced by those made of them; .* \(-o DIR\)"):
+        make_masks(capture, of_itself, overwrite=True, progress=False)
+    assert np.array_equal(ids_of(capture, names[0]), before)
 
 
 # Which images ----------------------------------------------------------------------------------------------------

@@ -355,14 +355,16 @@ def test_masks_of_a_larger_image_are_not_held_at_its_size(tmp_path):
 
 @pytest.mark.parametrize("kind", ["png", "json"])
 def test_masks_of_images_turned_upright_are_refused(tmp_path, kind):
-    """They were stretched: masks are for images as stored, whatever their EXIF orientation says."""
+    """They were stretched, as others of another shape: masks are for images as stored, whatever EXIF says."""
     cv2.imwrite(str(tmp_path / "a.png"), np.ones((160, 120), np.uint8))
     if kind == "json":
         (tmp_path / "a.png").unlink()
         (tmp_path / "a.json").write_text(json.dumps([{"segmentation": {"size": [160, 120], "counts": [0, 19200]}}]))
     assert len(ExistingMasks(tmp_path).of("a", (40, 30))) == 1
-    with pytest.raises(SceneError, match=r"masks are 120x160 pixels, the image 40x30.* EXIF orientation"):
-        ExistingMasks(tmp_path).of("a", (30, 40))
+    for shape in ((30, 40), (40, 40)):
+        says = rf"masks are 120x160 pixels, the image 40x{shape[0]}; expected the same aspect ratio.* EXIF orientation"
+        with pytest.raises(SceneError, match=says):
+            ExistingMasks(tmp_path).of("a", shape)
 
 
 def test_a_color_png_is_refused(tmp_path):
@@ -383,6 +385,8 @@ def test_any_callable():
     assert np.array_equal(listed.masks, masks)
     for none in ([], ()):
         assert as_proposals(none, (120, 160)).masks.shape == (0, 120, 160)
+    with pytest.raises(SceneError, match=r"3 proposals have tracks float64 \(3,\); expected a whole number each"):
+        Proposals(masks, scored.scores, np.arange(3.0))  # pyright: ignore[reportArgumentType]
     with pytest.raises(SceneError, match=r"masks are \(5, 4\) and \(120, 160\); expected all of \(120, 160\)"):
         as_proposals([*masks, masks[0, :5, :4]], (120, 160))
     with pytest.raises(SceneError, match="expected the same"):

@@ -223,6 +223,48 @@ def test_masks_are_made_of_the_faces(panoramas, tmp_path):
     assert sum(view.mask_count for view in scene.views) > 6
 
 
+@pytest.mark.parametrize("lens", ["EQUIRECTANGULAR", "OPENCV_FISHEYE"])
+def test_given_masks_of_whole_images_are_cut_like_the_images(tmp_path, lens):
+    capture_folder, given = write_panoramas(tmp_path / "c", lens, (256, 200 if lens == "OPENCV_FISHEYE" else 128)), {}
+    expected = read_capture(capture_folder)
+    maps = [view.mask_map() for view in expected.views]
+    (capture_folder / "masks").rename(tmp_path / "given")
+    # One image's masks as annotations of its own, and one by a COCO file for all images; the others are PNGs.
+    for name in ("pano_1", "pano_2"):
+        file = tmp_path / "given" / f"{name}.png"
+        ids = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        file.unlink()
+        masks = [(ids == id).T.ravel() for id in range(1, 7)]
+        runs = [np.diff([0, *(np.flatnonzero(np.diff(mask)) + 1), mask.size]).tolist() for mask in masks]
+        starts = [[0] if mask[0] else [] for mask in masks]
+        given[name] = [
+            {"image_id": 1, "segmentation": {"size": [*ids.shape], "counts": start + counts}}
+            for start, counts in zip(starts, runs, strict=True)
+        ]
+    (tmp_path / "given" / "pano_1.json").write_text(json.dumps(given["pano_1"]))
+    coco = {"images": [{"id": 1, "file_name": "images/pano_2.jpg"}], "annotations": given["pano_2"]}
+    (tmp_path / "given" / "all.json").write_text(json.dumps(coco))
+    (capture_folder / "mask_features.npz").unlink()
+    settings = MaskSettings(str(tmp_path / "given"), encoder=None, tracks=True)
+    make_masks(capture_folder, settings, progress=False)
+    for view, before, ids in zip(read_capture(capture_folder).views, expected.views, maps, strict=True):
+        things = np.append(before.mask_features.argmax(1), [-1, -1])[ids]  # NOT_SEEN, too, is outside every mask
+        made = view.mask_map()
+        assert len(np.unique(made * 8 + things)) == len(np.unique(made)) == len(np.unique(things)), view.name
+        np.testing.assert_array_equal(made < 0, things < 0)
+        if view.name.startswith("pano_0") and view.mask_count:
+            assert view.mask_tracks is not None, "a thing has one track on all faces"
+            np.testing.assert_array_equal(np.append(view.mask_tracks, -1)[made], things)
+    settings = MaskSettings(str(tmp_path / "given"), encoder=None)
+    assert make_masks(capture_folder, settings, progress=False).done_before == 0
+    ids = cv2.imread(str(capture_folder / "masks" / "pano_0" / "front.png"), cv2.IMREAD_UNCHANGED)
+    write_image(tmp_path / "given" / "pano_0" / "front.png", (ids > 0).astype(np.uint8))
+    made = make_masks(capture_folder, settings, progress=False)
+    assert cv2.imread(str(capture_folder / "masks" / "pano_0" / "front.png"), cv2.IMREAD_UNCHANGED).max() == 1, (
+        "a face's own masks come first"
+    )
+
+
 def test_what_the_lens_did_not_see_says_nothing(tmp_path):
     """A fisheye's side faces are cut to its rim; what lies beyond is neither in a mask nor outside of all."""
     write_panoramas(tmp_path, "OPENCV_FISHEYE", (256, 200))

@@ -70,13 +70,14 @@ class Face:
     def mask_ids(self, ids: IntArray) -> IntArray:
         """The ids (h, w) of the distorted image -> (H, W) of this view, by nearest pixel; NOT_SEEN where it has
         none."""
-        return self._picked(ids, NOT_SEEN)
+        return self.picked(ids, NOT_SEEN)
 
     def depths(self, depth: FloatArray) -> FloatArray:
         """As `mask_ids`, for depths along this view's axis; 0 where the image has none."""
-        return self._picked(depth, 0)
+        return self.picked(depth, 0)
 
-    def _picked(self, values: NDArray, otherwise: int) -> NDArray:
+    def picked(self, values: NDArray, otherwise: int) -> NDArray:
+        """As `mask_ids`, for values of any type; ``otherwise`` where the image has none."""
         expected = (self.whole.height, self.whole.width)
         if values.shape != expected:
             raise SceneError(f"the map is {values.shape}; expected the camera's {expected} (rows, columns)")

@@ -38,8 +38,11 @@ class Proposals:
             raise SceneError(
                 f"{len(self.masks)} proposals have scores {self.scores.shape}; expected a finite one per proposal"
             )
-        if self.tracks is not None and self.tracks.shape != self.scores.shape:
-            raise SceneError(f"{len(self.masks)} proposals have tracks {self.tracks.shape}; expected one per proposal")
+        tracks = self.tracks
+        if tracks is not None and (tracks.shape != self.scores.shape or tracks.dtype.kind not in "iu"):
+            raise SceneError(
+                f"{len(self.masks)} proposals have tracks {tracks.dtype} {tracks.shape}; expected a whole number each"
+            )
 
     def __len__(self) -> int:
         return len(self.masks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import posixpath
 import runpy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, first_line
+from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.images import MAX_PIXELS, same_shape, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
-from og_pointcloud.scene import DoubleArray, numbers_of
+from og_pointcloud.scene import DoubleArray, IntArray, numbers_of
 
 _READING_COCO = Lock()
 """A file is read once, not once in each thread: from Python 3.12 on, cached_property does not see to it."""
@@ -143,14 +145,39 @@ class ExistingMasks:
     folder: Path
     tracks: bool = False
 
-    def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
-        """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
-        # The image's own files come before files for all images.
-        png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
-        if png.is_file():
-            return from_ids(_resized(read_ids(png), shape, str(png)), none=-1, tracks=self.tracks)
-        if single.is_file():
-            return _from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single), shape)
+    def of(self, image_name: str, shape: tuple[int, int], face: Face | None = None) -> Proposals:
+        """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none.
+
+        face: of a cube, which the image is; without masks of its own, it gets those of the whole image, cut like it.
+        """
+        found = self._stored(image_name)
+        if found is None and face is not None:
+            image_name = posixpath.dirname(image_name)
+            found = self._stored(image_name)
+        else:
+            face = None
+        if found is None:
+            raise SceneError(
+                f"{self.folder} has no masks for image '{image_name}'; expected {image_name}.png or {image_name}.json "
+                "in it, or a COCO .json that lists it"
+            )
+        stored, source = found
+        if isinstance(stored, list):
+            return _from_annotations(stored, source, shape, face)
+        return from_ids(_placed(stored, shape, face, source, -1), none=-1, tracks=self.tracks)
+
+    def files(self, image_name: str, face: Face | None = None) -> list[Path]:
+        """The files that hold masks of this image alone. All others that are read are the folder's ``*.json``."""
+        names = [image_name] if face is None else [image_name, posixpath.dirname(image_name)]
+        files = (self.folder / f"{name}{suffix}" for name in names for suffix in (".png", ".json"))
+        return [file for file in files if file.is_file()]
+
+    def _stored(self, image_name: str) -> tuple[IntArray | list[dict[str, Any]], str] | None:
+        """The id map (H, W), -1 outside every mask, or the annotations of an image, and where they are."""
+        for file in self.files(image_name):  # its own files come before files for all images
+            if file.suffix == ".png":
+                return read_ids(file), str(file)
+            return _annotations(read_json(file, MAX_JSON_BYTES)), str(file)
         # Views are named by stem, or by a path below a folder that may be part of COCO's paths.
         with _READING_COCO:
             coco = self._coco
@@ -160,17 +187,12 @@ class ExistingMasks:
             path for path in alike
             if f"/{path}".endswith(f"/{image_name}") or ("/" in path and f"/{image_name}".endswith(f"/{path}"))
         ]  # fmt: skip
-        if len(named) == 1:
-            return _from_annotations(alike[named[0]], f"{self.folder}, image '{named[0]}'", shape)
-        if named:
+        if len(named) > 1:
             raise SceneError(
                 f"{self.folder} lists {len(named)} images that '{image_name}' could be ({', '.join(named):.120}); "
                 "expected one: use the paths of the pose file in the COCO file"
             )
-        raise SceneError(
-            f"{self.folder} has no masks for image '{image_name}'; expected {image_name}.png or {image_name}.json in "
-            "it, or a COCO .json that lists it"
-        )
+        return (alike[named[0]], f"{self.folder}, image '{named[0]}'") if named else None
 
     @cached_property
     def _coco(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
@@ -259,8 +281,10 @@ def _annotations(found: Any) -> list[dict[str, Any]]:
     return found
 
 
-def _from_annotations(annotations: Sequence[dict[str, Any]], source: str, shape: tuple[int, int]) -> Proposals:
-    """The masks of one image's annotations, each resized to ``shape`` at once: of a larger image, all would not fit
+def _from_annotations(
+    annotations: Sequence[dict[str, Any]], source: str, shape: tuple[int, int], face: Face | None
+) -> Proposals:
+    """The masks of one image's annotations, each brought to ``shape`` at once: of a larger image, all would not fit
     into memory."""
     _check_room(len(annotations), shape, source)
     masks, scores, stored = np.zeros((len(annotations), *shape), np.bool_), [], None
@@ -274,7 +298,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str, shape:
         stored = stored or mask.shape
         if mask.shape != stored:
             raise SceneError(f"{where} is {mask.shape}, the first {stored}; expected masks of one image")
-        masks[index] = _resized(mask, shape, where)
+        masks[index] = _placed(mask, shape, face, where, False)
         score = annotation.get("score", annotation.get("predicted_iou", 1.0))
         # Not numpy's functions, which refuse whole numbers beyond 64 bits.
         finite = isinstance(score, (int, float)) and abs(score) < math.inf
@@ -310,14 +334,22 @@ def _inside(corners: DoubleArray, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return np.logical_xor.accumulate(flips[:, :width], axis=1)
 
 
+def _placed(image: NDArray[Any], shape: tuple[int, int], face: Face | None, source: str, outside: int) -> NDArray[Any]:
+    """A mask or id map at the size of its image, (H, W); if a face is given, cut like the face, which has this size.
+    outside: the value where the lens saw nothing."""
+    if face is None:
+        return _resized(image, shape, source)
+    face = face.of_size(shape[1], shape[0])
+    return face.picked(_resized(image, (face.whole.height, face.whole.width), source), outside)
+
+
 def _resized(image: NDArray[Any], shape: tuple[int, int], source: str) -> NDArray[Any]:
-    """A mask or id map (H, W) at another size, by nearest pixel. SceneError where its sides are those of the image
-    turned by a quarter."""
+    """A mask or id map (h, w) at another size (H, W), by nearest pixel. SceneError where it would be stretched."""
     height, width = image.shape
-    if same_shape((width, height), shape) and not same_shape((height, width), shape):
+    if not same_shape((height, width), shape):
         raise SceneError(
-            f"{source}: the masks are {width}x{height} pixels, the image {shape[1]}x{shape[0]}; expected masks of the "
-            "image as stored: make them without turning it by its EXIF orientation"
+            f"{source}: the masks are {width}x{height} pixels, the image {shape[1]}x{shape[0]}; expected the same "
+            "aspect ratio: make masks of the whole image as stored, not turned by its EXIF orientation"
         )
     # The old pixel that contains the center of each new pixel.
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]

@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.encode import encoder_folder
-from og_pointcloud.masking.existing import user_source
+from og_pointcloud.masking.existing import ExistingMasks, user_source
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 from og_pointcloud.models import model_folder
@@ -86,10 +87,10 @@ def make_masks(
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate)
     _refuse_name(chosen)
-    _refuse_foreign(target, overwrite)
+    _refuse_foreign(target, overwrite, settings.folder)
     # Names of work files encode everything that determines their contents, so that existing ones can be reused.
     work = target / WORK_FOLDER / _fingerprint(settings)
-    tasks = [ImageTask(each, work / f"{_digest(_state_of(each))}.npz") for each in chosen]
+    tasks = [ImageTask(each, work / f"{_digest(_state_of(each, settings.folder))}.npz") for each in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
     made, done_before = None if overwrite else _made_before(target, tasks, key), len(tasks)
     if made is None:
@@ -134,22 +135,30 @@ def _refuse_name(chosen: Sequence[Photograph]) -> None:
 
 
 def _fingerprint(settings: MaskSettings) -> str:
-    """A name for settings and the user's masks, code and models that they refer to: other work files are not reused."""
+    """A name for settings and the user's code, models and COCO files that they refer to: other work files are not
+    reused."""
     of_image = replace(settings, every=1)  # which images are used does not change the masks of any
     kind, _, place = settings.proposer.partition(":")
-    given = sorted(settings.folder.rglob("*")) if settings.folder else user_source(place) if kind == "python" else []
+    given = user_source(place) if kind == "python" else []
+    if settings.folder:  # not all files in it: it may be the capture; those of single images are in `_state_of`
+        given = sorted(settings.folder.glob("*.json"))
     encoder, model = settings.encoder, place if kind == "sam" else None
     models = encoder_folder(encoder) if encoder else None, model_folder(model) if model else None
     given = [*given, *(file for folder in models if folder for file in sorted(folder.rglob("*")))]
     return _digest([VERSION, asdict(of_image), [_state(file) for file in given if file.is_file()]])
 
 
-def _state_of(photograph: Photograph) -> list[Any]:
-    """What decides the pixels of a photograph. Those of a face depend on the lens."""
+def _state_of(photograph: Photograph, folder: Path | None) -> list[Any]:
+    """What decides the pixels of a photograph, and its masks in a folder of the user's. Those of a face depend on the
+    lens."""
     face = photograph.face
     cameras = [] if face is None else [[of.width, of.height, *of.intrinsics] for of in (face.camera, face.whole)]
     turns = [photograph.quarter_turns] if photograph.quarter_turns else []
-    return [photograph.name, *_state(photograph.file), *cameras, *([asdict(face.lens)] if face else []), *turns]
+    masks = ExistingMasks(folder).files(photograph.name, face) if folder else []
+    return [
+        photograph.name, *_state(photograph.file), *cameras, *([asdict(face.lens)] if face else []), *turns,
+        *map(_state, masks),
+    ]  # fmt: skip
 
 
 def _state(file: Path) -> tuple[str, int, int]:
@@ -169,7 +178,8 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
     """Process the unfinished images, with a preview after the first ones."""
     waiting = [task for task in tasks if not task.work_file.exists()]
     broken, previewed = [], False
-    for wrong in with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress):
+    made = with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress)
+    for wrong in chain([None], made):  # first, the preview of images that an interrupted run has done
         if wrong:
             broken.append(wrong)
             warnings.warn(wrong, stacklevel=4)
@@ -195,9 +205,15 @@ def _shown(task: ImageTask, settings: MaskSettings) -> tuple[NDArray[np.uint8], 
 # The final files, and the record by which the next run recognizes them --------------------------------------------
 
 
-def _refuse_foreign(target: Path, overwrite: bool) -> None:
-    """OgPointcloudError where masks or features that were not made here would be replaced, or folders are links."""
+def _refuse_foreign(target: Path, overwrite: bool, given: Path | None) -> None:
+    """OgPointcloudError where masks or features that were not made here would be replaced, or folders are links.
+    given: the user's folder of masks."""
     folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
+    if given is not None and given.resolve() == folder.resolve():
+        raise OgPointcloudError(
+            f"the masks in {given} would be replaced by those made of them; expected a folder that is only read: give "
+            "another output (-o DIR), or move them"
+        )
     for link in (folder, target / WORK_FOLDER):
         if link.is_symlink():  # an untrusted capture could redirect masks anywhere
             raise OgPointcloudError(
@@ -206,7 +222,8 @@ def _refuse_foreign(target: Path, overwrite: bool) -> None:
             )
     if overwrite or (folder / MADE_NAME).is_file():
         return
-    found = folder if folder.is_dir() and any(folder.iterdir()) else features
+    # Hidden files are no masks: a killed run leaves one where it had just begun to write.
+    found = folder if folder.is_dir() and any(file.name[0] != "." for file in folder.iterdir()) else features
     if found.exists():
         raise OgPointcloudError(
             f"{found} was not made by this command and would be replaced; expected nothing there: give another folder "

@@ -61,7 +61,10 @@ class ImageWorker:
         proposer, turns = self.proposer, photograph.quarter_turns
         upright = np.ascontiguousarray(np.rot90(image, turns))
         existing = isinstance(proposer, ExistingMasks)  # of the image as stored
-        proposals = proposer.of(photograph.name, image.shape[:2]) if existing else proposer.propose(upright)
+        if existing:
+            proposals = proposer.of(photograph.name, image.shape[:2], photograph.face)
+        else:
+            proposals = proposer.propose(upright)
         ids, chosen = masks_of_level(proposals, self.settings.level)
         ids, of_upright = (ids, np.rot90(ids, turns)) if existing else (np.rot90(ids, -turns), ids)
         masks = of_upright == np.arange(ids.max(initial=-1) + 1)[:, None, None]
