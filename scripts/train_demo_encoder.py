@@ -44,11 +44,11 @@ from transformers import CLIPTokenizer
 
 from og_pointcloud.masking.contracts import LEVELS, ImageModel
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
-from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
+from og_pointcloud.masking.encode import DEMO_SPACE, open_encoder
 from og_pointcloud.masking.levels import masks_of_level
 from og_pointcloud.masking.opencv import OpenCVProposer
+from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder
 from og_pointcloud.text.encoder import TextEncoder as TrainedTextEncoder
-from og_pointcloud.text.encoder import read_text_encoder
 from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, Tokenizer, open_tokenizer
 
@@ -561,7 +561,7 @@ def _report(
 def main() -> None:
     """Train, export and measure, or measure alone."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=DEMO_FOLDER, help="folder of the two halves")
+    parser.add_argument("-o", "--output", type=Path, default=DEMO_ENCODER, help="folder of the two halves")
     parser.add_argument("--measure", action="store_true", help="do not train")
     parser.add_argument("--steps", type=int, default=1600)
     parser.add_argument("--views", type=int, default=2, help="of each room: other rooms teach more than other views")

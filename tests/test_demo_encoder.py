@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
-from og_pointcloud.text.encoder import encoder_for, find_encoder
+from og_pointcloud.masking.encode import DEMO_SPACE, open_encoder
+from og_pointcloud.text.encoder import DEMO_ENCODER, encoder_for, find_encoder
 
 pytest.importorskip("open3d")
 
@@ -53,7 +53,7 @@ def _right(seen, names):
 
 
 def test_it_is_small_and_named_for_what_it_is():
-    assert sum(path.stat().st_size for path in DEMO_FOLDER.rglob("*") if path.is_file()) < 1_000_000
+    assert sum(path.stat().st_size for path in DEMO_ENCODER.rglob("*") if path.is_file()) < 1_000_000
     assert open_encoder("demo").feature_space == find_encoder(DEMO_SPACE).feature_space == DEMO_SPACE
     assert "demo" in DEMO_SPACE
 

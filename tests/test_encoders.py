@@ -11,7 +11,8 @@ import pytest
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
-from og_pointcloud.masking.encode import DEMO_FOLDER, CropEncoder, OnnxModel, open_encoder
+from og_pointcloud.masking.encode import CropEncoder, OnnxModel, open_encoder
+from og_pointcloud.text.encoder import DEMO_ENCODER
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 256, (40, 60, 3), np.uint8)
@@ -129,7 +130,7 @@ def test_an_encoder_is_found_by_its_folder_and_its_name(tmp_path, monkeypatch):
 def exported(folder, name="manifest.json", edit=None, **fields):
     """The demo encoder's image half with other bytes in a file, or other fields in its manifest."""
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(DEMO_FOLDER / "image", folder)
+    shutil.copytree(DEMO_ENCODER / "image", folder)
     data = (folder / name).read_bytes()
     (folder / name).write_bytes(edit(data) if edit else json.dumps({**json.loads(data), **fields}).encode())
     return folder
@@ -149,4 +150,4 @@ def test_an_exported_folder_is_checked_before_it_runs(tmp_path):
     with pytest.raises(OgPointcloudError, match="returns float32"):
         model(np.zeros((1, 3, 48, 48), np.float32))
     with pytest.raises(OgPointcloudError, match="does not run"):
-        OnnxModel(DEMO_FOLDER / "image")(np.zeros((1, 4, 48, 48), np.float32))
+        OnnxModel(DEMO_ENCODER / "image")(np.zeros((1, 4, 48, 48), np.float32))

@@ -25,8 +25,8 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.images import EXIF_ORIENTATION, exif_quarter_turns
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.encode import DEMO_FOLDER
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
+from og_pointcloud.text.encoder import DEMO_ENCODER
 
 ALONE = MaskSettings(encoder=None)
 QUICK = MaskSettings(BY_COLOR, encoder=None)
@@ -81,7 +81,7 @@ def test_words_are_a_list_like_any_other(tmp_path, monkeypatch):
 def test_masks_are_made_again_where_the_encoder_behind_a_path_has_changed(tmp_path):
     make_capture(tmp_path / "c")
     encoder, settings = tmp_path / "encoder", MaskSettings(encoder=str(tmp_path / "encoder"))
-    shutil.copytree(DEMO_FOLDER / "image", encoder)
+    shutil.copytree(DEMO_ENCODER / "image", encoder)
 
     def made_by(name):
         manifest = json.loads((encoder / "manifest.json").read_text())

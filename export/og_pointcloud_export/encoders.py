@@ -295,9 +295,8 @@ def _image_parity(graph: bytes, model: ImageModel) -> dict[str, Any]:
     pixels = model.preprocessing.pixels(squares)
     session = open_session(graph)
     got, expected = np.asarray(session.run(["image"], {"pixels": pixels})[0]), model(pixels)
-    patch = model.patch if isinstance(model, TransformersModel) else None
-    if patch is not None:
-        sides = (side * patch for side in PARITY_PATCHES)
+    if model.patch is not None:
+        sides = (side * model.patch for side in PARITY_PATCHES)
         wide = np.random.default_rng(1).normal(size=(1, 3, *sides)).astype(np.float32)
         patches = np.asarray(session.run(["patches"], {"pixels": wide})[0])
         got = np.concatenate([got, patches.reshape(-1, model.width)])

@@ -30,15 +30,13 @@ from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.dense import DenseEncoder
 from og_pointcloud.models import EncoderFormat, fetched_model, open_session
-from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
+from og_pointcloud.text.encoder import DEMO_ENCODER, MODELS_VARIABLE, model_folders
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 DEMO_SPACE = "og_pointcloud/demo-room-encoder"
 """Feature space of the demo encoder, which knows only the things of the procedural room."""
-DEMO_FOLDER = Path(__file__).parent / "demo_encoder"
-"""Its two halves: ``image`` and ``text``."""
 GRAPH = "image_encoder.onnx"
 OPERATORS = frozenset({
     "Add", "Clip", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Expand", "Gather", "Gemm", "GlobalAveragePool",
@@ -75,7 +73,7 @@ def encoder_folder(name: StrPath) -> Path | None:
     """The folder that `open_encoder` opens, None if there is none: a folder by its path, then by its stated feature
     space, then downloads of other tools."""
     if name == "demo":
-        return DEMO_FOLDER / "image"
+        return DEMO_ENCODER / "image"
     if (path := Path(name).expanduser()).exists():
         return path
     return ENCODER.find(str(name), model_folders()) or fetched_model(str(name))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,18 +61,18 @@ class ImageWorker:
         """
         proposer, turns = self.proposer, photograph.quarter_turns
         upright = np.ascontiguousarray(np.rot90(image, turns))
-        existing = isinstance(proposer, ExistingMasks)  # of the image as stored
-        if existing:
-            proposals = proposer.of(photograph.name, image.shape[:2], photograph.face)
+        if isinstance(proposer, ExistingMasks):  # of the image as stored
+            stored = proposer.of(photograph.name, image.shape[:2], photograph.face)
+            proposals = replace(stored, masks=np.rot90(stored.masks, turns, axes=(1, 2)))
         else:
             proposals = proposer.propose(upright)
         ids, chosen = masks_of_level(proposals, self.settings.level)
-        ids, of_upright = (ids, np.rot90(ids, turns)) if existing else (np.rot90(ids, -turns), ids)
-        masks = of_upright == np.arange(ids.max(initial=-1) + 1)[:, None, None]
+        masks = ids == np.arange(len(chosen))[:, None, None]
         space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
         features = self.encoder.embed(upright, masks) if self.encoder else np.zeros((len(masks), 1))
         # Components of unit vectors lose at most 0.05 % in 16 bits.
-        made = {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
+        stored_ids = np.rot90(ids, -turns)
+        made = {"feature_space": np.array(space), "ids": stored_ids, "features": features.astype(np.float16)}
         return made if proposals.tracks is None else {**made, "tracks": proposals.tracks[chosen]}
 
 

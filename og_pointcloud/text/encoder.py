@@ -46,7 +46,8 @@ OPERATORS = frozenset({
 })  # fmt: skip
 """The operators allowed in an encoder's graph: arithmetic without loops, random numbers, or graphs inside nodes."""
 DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
-"""The encoder that comes with the library: it knows the demo room and nothing else."""
+"""The encoder that comes with the library, its halves ``image`` and ``text``: it knows the demo room and nothing
+else."""
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
 MAX_TEMPLATES, MAX_TEMPLATE_CHARACTERS = 128, 400
