@@ -153,7 +153,7 @@ def image_of_8k() -> Answer:
     wanted = np.zeros((4320, 7680), bool)
     for top, left in _CORNERS:
         wanted[top : top + 128, left : left + 160] = True
-    weights = view_weights(gaussians, large, NEAR, wanted).toarray()
+    weights = view_weights(gaussians, large, NEAR, wanted).toarray().astype(np.float64)
     row = (np.cumsum(wanted) - 1).reshape(wanted.shape)
     ours = [weights[row[top : top + 128, left : left + 160]].sum(axis=(0, 1)) for top, left in _CORNERS]
     windows = (replace(large, width=160, height=128, cx=large.cx - left, cy=large.cy - top) for top, left in _CORNERS)
