@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
+from numba.core.event import trigger_event
 from numpy.typing import NDArray
 from visits import DIRECTIONS, SPACE, Thing, cameras, cast, scene, surface
 
@@ -16,6 +18,7 @@ from og_pointcloud.cloud import BACKGROUND, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.kernels import timed_compiling
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import (
     CodebookSettings,
@@ -393,3 +396,19 @@ def test_progress_of_training_says_nothing_without_a_terminal(capsys):
             for step in (1, 2):
                 report(name, step, 2, 0.5)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_compiling_is_told_and_timed(terminal, monkeypatch, capsys):
+    """Once on a terminal, where bars would seem to hang; its seconds are noted, and nothing where all was compiled."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal, raising=False)
+    first, later = Journal(progress=True), Journal(progress=True)
+    with timed_compiling(first):
+        for _ in range(2):
+            with trigger_event("numba:compile"), trigger_event("numba:compile"):
+                time.sleep(0.02)
+    with timed_compiling(later):
+        pass
+    assert capsys.readouterr().err.count("compiling") == terminal
+    assert first.notes["compiling"] > 0
+    assert later.notes == {}

@@ -230,6 +230,8 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     from og_pointcloud.text.encoder import find_encoder
 
     print_provenance(cloud.provenance, report["capture"])
+    if (seconds := cloud.provenance["notes"].get("compiling", 0)) > 1:
+        print(f"compiling took {seconds:.0f} s of this, which later fits do not need")
     total = report["points"]
     shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
     print(

@@ -25,7 +25,7 @@ from og_pointcloud.fitting.seen_colors import doubted_by_color
 from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.kernels import get_num_threads
+from og_pointcloud.kernels import get_num_threads, timed_compiling
 from og_pointcloud.rendering.geometry import drawn_spacing, isotropic
 from og_pointcloud.rendering.pixel_cells import typical_spacing
 from og_pointcloud.rendering.smoothing import smoothed
@@ -86,19 +86,20 @@ def fit(
         raise SceneError(f"scene is a {type(scene).__name__}; expected a Scene, as og.read_capture(FOLDER) returns")
     settings = fit_settings(settings)
     journal = Journal(progress)
-    with journal.stage("checks"):
-        checks = check_capture(scene)
-    warn_of_doubts(checks)
-    # The folder's files are removed once the cloud is made: only a run that ends earlier leaves them.
-    with WorkFolder.open(work) as kept:
-        if needs_tiles(scene, settings):
-            _check(scene, journal)
-            labelling, spacing = fit_tiles(_with_edges(scene, journal), settings, kept, journal, executor)
-            cloud = _cloud_of(scene, labelling, spacing, settings, journal)
-        else:
-            prepared = prepare(scene, settings, journal, kept)
-            # A temporary folder goes with the run: checkpoints in it would serve nobody.
-            cloud = fit_prepared(prepared, settings, journal, None if work is None else kept)
+    with timed_compiling(journal):
+        with journal.stage("checks"):
+            checks = check_capture(scene)
+        warn_of_doubts(checks)
+        # The folder's files are removed once the cloud is made: only a run that ends earlier leaves them.
+        with WorkFolder.open(work) as kept:
+            if needs_tiles(scene, settings):
+                _check(scene, journal)
+                labelling, spacing = fit_tiles(_with_edges(scene, journal), settings, kept, journal, executor)
+                cloud = _cloud_of(scene, labelling, spacing, settings, journal)
+            else:
+                prepared = prepare(scene, settings, journal, kept)
+                # A temporary folder goes with the run: checkpoints in it would serve nobody.
+                cloud = fit_prepared(prepared, settings, journal, None if work is None else kept)
     found = check_cloud(cloud, checks)
     warn_of_doubts(found)
     return with_checks(cloud, [*checks, *found])
