@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from laspy import LasData
 
 SIGNATURE = b"LASF"
-SAME_PLACE_SHARE = 1e-3
-"""Share of the extent by which labelled points may differ from the file's: float32 may have rounded map coordinates."""
 POINTS_PER_CHUNK, CHUNK_BYTES = 1_000_000, 1 << 26
 """Read at once, at most, so that memory use depends on the points in the file, not on the count in its header."""
 UNLABELLED = 1
@@ -150,8 +148,8 @@ def _points_of(source: Path, xyz_world: NDArray[np.floating]) -> LasData:
         if las is None or len(las.points) != count:
             raise SceneError(f"it has {stated} points, {count} were labelled; expected the labelled file")
         apart = max(float(np.abs(las[axis] - at).max(initial=0)) for axis, at in zip("xyz", xyz_world.T, strict=True))
-        extent = float(np.ptp(xyz_world, axis=0).max()) if count else 0.0
-        if not apart <= SAME_PLACE_SHARE * extent + max(las.header.scales):
+        rounding = np.spacing(np.float32(np.abs(xyz_world).max(initial=0)))  # other libraries' clouds are float32
+        if not apart <= rounding + max(las.header.scales):
             raise SceneError(
                 f"its points lie up to {apart:.4g} from those that were labelled; expected the labelled file, in its "
                 "order and without a pose"
